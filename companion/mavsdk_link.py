@@ -18,26 +18,11 @@ from mavsdk.plugins.offboard import AttitudeRate, Offboard, OffboardError, Veloc
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
+from airl_mav.core import constants
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import (
-    GRAVITY_M_S2,
-    TAKEOFF_REACHED_M,
-    TAKEOFF_REACHED_M_S,
-    UNMEASURED_A,
-    US_PER_S,
-)
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
-from companion.link_interface import (
-    STOP,
-    BatteryState,
-    BodyVelocity,
-    Due,
-    LinkError,
-    Quiet,
-    Setpoint,
-    VehicleStatus,
-)
+from companion import link_interface
 from companion.mavsdk_connection import (
     POSITION,
     PX4,
@@ -99,7 +84,7 @@ class MavsdkLink:
         clock: Clock,
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
-        poll: Callable[[int, Due, Quiet], None] | None = None,
+        poll: Callable[[int, link_interface.Due, link_interface.Quiet], None] | None = None,
     ) -> None:
         """Open a connection, see `open_connection`; `connect` waits for the vehicle.
 
@@ -154,7 +139,7 @@ class MavsdkLink:
             return
         stopwatch = WallClock()
         while not self.connected:
-            if stopwatch.time_us() > timeout_s * US_PER_S:
+            if stopwatch.time_us() > timeout_s * constants.US_PER_S:
                 raise self._unheard(timeout_s)
             self._pause_wall(stop)
         # `release` has destroyed the offboard plugin.
@@ -175,17 +160,19 @@ class MavsdkLink:
                     getattr(self._telemetry, f"set_rate_{name}")(rate_hz)
                     break
                 except TelemetryError as error:
-                    if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
-                        raise LinkError(f"no telemetry: {_refusal(error)}") from None
+                    if stopwatch.time_us() > STREAM_TIMEOUT_S * constants.US_PER_S:
+                        raise link_interface.LinkError(f"no telemetry: {_refusal(error)}") from None
                 self._pause_wall(stop)
 
-    def _unheard(self, timeout_s: float) -> LinkError:
-        return LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+    def _unheard(self, timeout_s: float) -> link_interface.LinkError:
+        return link_interface.LinkError(
+            f"no flight controller heard on {self.url} in {timeout_s:g} s"
+        )
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
         if self._abandon.is_set() or (stop is not None and stop.is_set()):
-            raise LinkError("stopped")
-        WallClock().sleep_until(int(STREAM_RETRY_S * US_PER_S), self._abandon)
+            raise link_interface.LinkError("stopped")
+        WallClock().sleep_until(int(STREAM_RETRY_S * constants.US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
         """Exchange the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
@@ -258,21 +245,23 @@ class MavsdkLink:
             np.array([w.roll_rad_s, w.pitch_rad_s, w.yaw_rad_s]),
         )
 
-    def status(self) -> VehicleStatus:
+    def status(self) -> link_interface.VehicleStatus:
         """Return armed state, flight mode and charge."""
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
         remaining = self.battery().remaining
-        return VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words, remaining)
+        return link_interface.VehicleStatus(
+            self.armed, mode is FlightMode.OFFBOARD, words, remaining
+        )
 
-    def battery(self) -> BatteryState:
+    def battery(self) -> link_interface.BatteryState:
         """Return the newest state of the battery."""
         told = self._telemetry.battery()
         percent, current_a = _known(told.remaining_percent), _known(told.current_battery_a)
-        return BatteryState(
+        return link_interface.BatteryState(
             # 0 V means that no battery report was received yet.
             _known(told.voltage_v) or None,
-            None if current_a == UNMEASURED_A else current_a,
+            None if current_a == constants.UNMEASURED_A else current_a,
             None if percent is None else percent / 100.0,
         )
 
@@ -297,7 +286,7 @@ class MavsdkLink:
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
         missing: list[str] = []
         # The loop ends once health was good without interruption for HEALTH_SETTLE_S.
-        while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
+        while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * constants.US_PER_S):
             lacking = f" ({', '.join(missing)})" if missing else ""
             late = f"not healthy after {timeout_s:g} s: it refuses to arm{lacking}"
             self._check(deadline_us, late, stop)
@@ -324,7 +313,7 @@ class MavsdkLink:
         if now_us < due_us:
             return due_us
         self._call("origin", lambda: self._action.set_gps_global_origin(*origin))
-        return now_us + int(ORIGIN_RETRY_S * US_PER_S)
+        return now_us + int(ORIGIN_RETRY_S * constants.US_PER_S)
 
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
         """Take off and wait until an altitude above the start is reached, or `stop` is set."""
@@ -332,7 +321,7 @@ class MavsdkLink:
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
-        deadline_us, least_m = self._deadline(timeout_s), altitude_m - TAKEOFF_REACHED_M
+        deadline_us, least_m = self._deadline(timeout_s), altitude_m - constants.TAKEOFF_REACHED_M
 
         def left(frames: Sequence[bytes]) -> tuple[float, float]:
             """Return the remaining climb [m] and the climb speed [m/s]; NaN = unknown."""
@@ -350,22 +339,22 @@ class MavsdkLink:
         def lasts_us(frames: Sequence[bytes]) -> float:
             """Return the minimum remaining climb time [µs], for an acceleration of 1 g."""
             left_m, speed = left(frames)
-            g = GRAVITY_M_S2
+            g = constants.GRAVITY_M_S2
             least_s = (math.sqrt(speed**2 + 2.0 * g * max(0.0, left_m)) - speed) / g
-            return 0.0 if math.isnan(left_m) else least_s * US_PER_S
+            return 0.0 if math.isnan(left_m) else least_s * constants.US_PER_S
 
         while True:
             state = self.kinematics()
             height, speed = start_down - float(state.position[2]), abs(float(state.velocity[2]))
             # Height and speed must both settle before offboard.
-            if height > least_m and speed < TAKEOFF_REACHED_M_S:
+            if height > least_m and speed < constants.TAKEOFF_REACHED_M_S:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
             self._pause_until(high, lasts_us, deadline_us, stop)
 
     def enter_offboard(self) -> None:
         """Send a zero setpoint, switch to offboard and wait until setpoints take effect."""
-        self.send_setpoint(STOP)
+        self.send_setpoint(link_interface.STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
 
@@ -383,7 +372,7 @@ class MavsdkLink:
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)
-            self.send_setpoint(STOP)
+            self.send_setpoint(link_interface.STOP)
             self._pause(OFFBOARD_REPEAT_S)
 
     def _flies_offboard(self) -> bool:
@@ -409,13 +398,13 @@ class MavsdkLink:
         self._direct = self._direct or MavlinkDirect(self._system)
         self._direct.subscribe_message(name, heard)
 
-    def send_setpoint(self, setpoint: Setpoint) -> None:
+    def send_setpoint(self, setpoint: link_interface.Setpoint) -> None:
         """Send a setpoint; MAVSDK repeats it at 20 Hz until the next setpoint of any kind."""
         self.setpoints_sent += 1
         offboard = self._offboard
         try:
             # MAVSDK uses degrees.
-            if isinstance(setpoint, BodyVelocity):
+            if isinstance(setpoint, link_interface.BodyVelocity):
                 *velocity, yaw_rate = setpoint
                 offboard.set_velocity_body(VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate)))
                 return
@@ -427,7 +416,7 @@ class MavsdkLink:
             else:
                 offboard.set_attitude_rate(AttitudeRate(*degrees, thrust))
         except OffboardError as error:
-            raise LinkError(f"setpoint refused: {_reason(error)}") from None
+            raise link_interface.LinkError(f"setpoint refused: {_reason(error)}") from None
 
     def leave_offboard(self) -> None:
         """Switch to Hold; MAVSDK stops repeating setpoints."""
@@ -452,16 +441,16 @@ class MavsdkLink:
         try:
             call()
         except (ActionError, OffboardError, TelemetryError) as error:
-            raise LinkError(f"{what} failed: {_reason(error)}") from None
+            raise link_interface.LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
-        return self._clock.time_us() + int(timeout_s * US_PER_S)
+        return self._clock.time_us() + int(timeout_s * constants.US_PER_S)
 
     def _check(
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
     ) -> None:
         if (why := self._over(deadline_us, message, stop)) is not None:
-            raise LinkError(why)
+            raise link_interface.LinkError(why)
 
     def _over(
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
@@ -479,12 +468,12 @@ class MavsdkLink:
         return None
 
     def _pause(self, seconds: float = POLL_S) -> None:
-        self._clock.sleep_until(self._clock.time_us() + int(seconds * US_PER_S))
+        self._clock.sleep_until(self._clock.time_us() + int(seconds * constants.US_PER_S))
 
     def _pause_until(
         self,
-        due: Due,
-        quiet_us: Quiet,
+        due: link_interface.Due,
+        quiet_us: link_interface.Quiet,
         deadline_us: int,
         stop: threading.Event | None = None,
     ) -> None:
@@ -493,7 +482,7 @@ class MavsdkLink:
             self._pause()
         else:
             self._poll(
-                int(POLL_S * US_PER_S),
+                int(POLL_S * constants.US_PER_S),
                 lambda frames: due(frames) or self._over(deadline_us, stop=stop) is not None,
                 quiet_us,
             )

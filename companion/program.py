@@ -32,23 +32,10 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import checks
 from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion.frame_source import (
-    FrameSource,
-    OpenCamera,
-    ReceivedFrame,
-    open_named_camera,
-)
+from companion import frame_source, offboard_mission
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RATE_HZ, signed
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import (
-    FRAME_TIMEOUT_S,
-    Mission,
-    MissionResult,
-    check_camera,
-    fly_mission,
-    mount_of,
-)
 from companion.pilot import age_of
 from companion.watchdog import ThreadGuard
 
@@ -60,7 +47,7 @@ FLIGHT_S = 600.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class MissionSetup(Mission):
+class MissionSetup(offboard_mission.Mission):
     """Mission of a stand-alone companion."""
 
     vehicle: VehicleProfile
@@ -135,14 +122,16 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         limits=limits,
         latency=sampler,
         compensator=compensator,
-        mount_rad=mount_of(vehicle),
+        mount_rad=offboard_mission.mount_of(vehicle),
         start=asked.start,
         vehicle=vehicle,
         setup=setup,
     )
 
 
-def mission_camera(asked: StandAloneCompanion, mission: MissionSetup, clock: Clock) -> OpenCamera:
+def mission_camera(
+    asked: StandAloneCompanion, mission: MissionSetup, clock: Clock
+) -> frame_source.OpenCamera:
     """Open the requested camera. Raises FieldError if it is unusable."""
     vehicle = mission.vehicle
     policy, cameras = mission.policy, vehicle.cameras
@@ -151,21 +140,23 @@ def mission_camera(asked: StandAloneCompanion, mission: MissionSetup, clock: Clo
         cameras = {k: v for k, v in cameras.items() if k in policy.card.observation.cameras}
     further = {name: Intrinsics.of(each) for name, each in cameras.items()}
     wanted, whose = Intrinsics.of(vehicle.camera), f"vehicle {asked.vehicle}"
-    return open_named_camera(asked.camera, clock, wanted, whose, further)
+    return frame_source.open_named_camera(asked.camera, clock, wanted, whose, further)
 
 
 def reporting(
     asked: StandAloneCompanion,
     mission: MissionSetup,
     link: MavsdkLink,
-    camera: OpenCamera,
+    camera: frame_source.OpenCamera,
     clock: Clock,
-) -> AbstractContextManager[FrameSource]:
+) -> AbstractContextManager[frame_source.FrameSource]:
     """Send reports to the vehicle's network, if their add-on is there; return the frames to use."""
     place = entries("companion", "REPORTS").get("vehicle")
     if place is None:
         return nullcontext(camera)
-    reports: AbstractContextManager[FrameSource] = load(place)(asked, mission, link, camera, clock)
+    reports: AbstractContextManager[frame_source.FrameSource] = load(place)(
+        asked, mission, link, camera, clock
+    )
     return reports
 
 
@@ -194,7 +185,7 @@ def fly_alone(
     abandon: threading.Event,
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
-) -> MissionResult:
+) -> offboard_mission.MissionResult:
     """Fly one mission with a real flight controller; `stop` lands, `abandon` ends without landing.
 
     `waiting` is called before waiting for the flight controller. Raises UsageError or LinkError.
@@ -218,13 +209,13 @@ def fly_alone(
         waiting()
         link.connect(asked.connect_timeout, stop)
         # The camera is checked before the status messages start, and before take-off.
-        check_camera(mission.policy, camera, stop, mission.compensator)
+        offboard_mission.check_camera(mission.policy, camera, stop, mission.compensator)
         with (
             reporting(asked, mission, link, camera, clock) as frames,
             recorded(asked, mission, link, clock) as box,
         ):
             decided = None if box is None else box.decided
-            result = fly_mission(
+            result = offboard_mission.fly_mission(
                 link, frames, mission, clock, stop, abandon, begin, ThreadGuard(clock), decided
             )
             link.tell(f"airl: {result.reason}")
@@ -293,15 +284,15 @@ def check_on_ground(
 
 
 def look_at_camera(
-    mission: MissionSetup, camera: FrameSource, clock: Clock, stop: threading.Event
+    mission: MissionSetup, camera: frame_source.FrameSource, clock: Clock, stop: threading.Event
 ) -> Iterator[CheckResult]:
     """Check rate, age and changes of frames, and if they fit the policy."""
-    first = camera.wait(-1, FRAME_TIMEOUT_S)
+    first = camera.wait(-1, offboard_mission.FRAME_TIMEOUT_S)
     if first is None:
-        yield CheckResult("camera", False, f"no frame for {FRAME_TIMEOUT_S:g} s")
+        yield CheckResult("camera", False, f"no frame for {offboard_mission.FRAME_TIMEOUT_S:g} s")
         return
     try:
-        check_camera(mission.policy, camera, stop, mission.compensator)
+        offboard_mission.check_camera(mission.policy, camera, stop, mission.compensator)
     except UsageError as error:
         yield CheckResult("camera", False, str(error))
         return
@@ -371,7 +362,9 @@ def look_at_vehicle(
     )
 
 
-def time_decisions(mission: MissionSetup, seen: ReceivedFrame, state: Kinematics) -> CheckResult:
+def time_decisions(
+    mission: MissionSetup, seen: frame_source.ReceivedFrame, state: Kinematics
+) -> CheckResult:
     """Measure the policy's inference time (t2) on a received frame."""
     frame, watch, took_us = seen.frame, WallClock(), []
     # The same observation each time: only the duration matters.

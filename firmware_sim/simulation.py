@@ -16,13 +16,8 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.render import Motion
+from airl_mav.core import constants
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import (
-    TAKEOFF_REACHED_M,
-    TAKEOFF_REACHED_M_S,
-    TICK_US,
-    US_PER_S,
-)
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -59,10 +54,10 @@ GROUND_LIMIT_S = 30.0
 CLIMB_LIMIT_M_S = 0.5
 """Minimum mean climb speed [m/s]; PX4 takes off at 1.5 m/s."""
 
-LOOK_US = US_PER_S // 10
+LOOK_US = constants.US_PER_S // 10
 """Interval of checks of the vehicle's state [µs]."""
 
-ARM_RETRY_US = US_PER_S
+ARM_RETRY_US = constants.US_PER_S
 """Interval of arm requests while pre-arm checks fail [µs]."""
 
 NEVER_US = 1 << 61
@@ -96,7 +91,9 @@ class HoverStart(NamedTuple):
         if simulation.faults is not None:
             simulation.faults.begin(NEVER_US)
         limit_s = GROUND_LIMIT_S + self.altitude_m / CLIMB_LIMIT_M_S
-        reached = self._climb(simulation, autopilot, simulation.time_us + round(limit_s * US_PER_S))
+        reached = self._climb(
+            simulation, autopilot, simulation.time_us + round(limit_s * constants.US_PER_S)
+        )
         simulation.recorder, autopilot.on_message = recorder, on_message
         if reached:
             autopilot.take_messages()
@@ -119,13 +116,13 @@ class HoverStart(NamedTuple):
                     autopilot.takeoff(self.altitude_m)
             elif flight.phase is FlightPhase.AIR and flight.mode is Mode.HOLD:
                 height_m = start_m - down_m
-                climbs = height_m < self.altitude_m - TAKEOFF_REACHED_M
-                if not climbs and abs(down_m_s) < TAKEOFF_REACHED_M_S:
+                climbs = height_m < self.altitude_m - constants.TAKEOFF_REACHED_M
+                if not climbs and abs(down_m_s) < constants.TAKEOFF_REACHED_M_S:
                     return True
         return False
 
 
-MOST_TICKS = US_PER_S // TICK_US
+MOST_TICKS = constants.US_PER_S // constants.TICK_US
 """Maximum number of ticks in one call of `advance`."""
 
 LOG_TICKS = 2 * MOST_TICKS
@@ -348,7 +345,7 @@ class Simulation:
             autopilot.take(self._sample)
             self._sample = None
         plant, record, done = self.plant, autopilot.record, 0
-        most = max(1, math.ceil(min((until_us - self.time_us) / TICK_US, MOST_TICKS)))
+        most = max(1, math.ceil(min((until_us - self.time_us) / constants.TICK_US, MOST_TICKS)))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
             if done and arrivals is not None and arrives_us <= self.time_us:
@@ -357,7 +354,7 @@ class Simulation:
                 if self.recorder is not None:
                     self.recorder.before_controls(done)
             due_us = min(autopilot.decide_if_due(), arrives_us)
-            ticks = max(1, math.ceil(min((due_us - self.time_us) / TICK_US, most - done)))
+            ticks = max(1, math.ceil(min((due_us - self.time_us) / constants.TICK_US, most - done)))
             log = slice(self._logged + done, self._logged + done + ticks)
             flown, event = plant.glide(record, ticks, self._truths[log], self._flown[log])
             if event == FUSE:
@@ -365,9 +362,9 @@ class Simulation:
                 autopilot.fuse(plant.newest(), record["left"].item(0))
             done += flown
             # Texts about a landing bear the time of the tick that detects it.
-            self.time_us += (flown - 1) * TICK_US
+            self.time_us += (flown - 1) * constants.TICK_US
             changed = autopilot.flown(plant.newest, event)
-            self.time_us += TICK_US
+            self.time_us += constants.TICK_US
             # Measurements fused in Python can change the aids in use.
             if changed or event in _ENDS or (event == FUSE and not autopilot.estimator.compiled):
                 break

@@ -8,25 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
+from airl_mav.arena import placement
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Statics, Tour
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.placed_assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
-from airl_mav.arena.placement import (
-    TRIES,
-    Boxes,
-    Floats,
-    Hills,
-    NoRoomError,
-    bounding_boxes,
-    draw_goal,
-    footprint_areas,
-    free_share,
-    join,
-    least_gap_m,
-    passage_exists,
-    place_all,
-    zone_radius_m,
-)
 from airl_mav.arena.relief import draw_ground, stand_on
 from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.walls import (
@@ -102,14 +87,14 @@ class _Request:
         return Building(len(self.plan.rooms), len(self.plan.doors), len(self.walls))
 
     @property
-    def hills(self) -> Hills | None:
+    def hills(self) -> placement.Hills | None:
         """Ground that obstructs flight at the flight altitude; None = flat floor."""
         if self.ground is None:
             return None
-        return Hills(self.ground, self.spec.flight_altitude_m - HEADROOM_M)
+        return placement.Hills(self.ground, self.spec.flight_altitude_m - HEADROOM_M)
 
     @cached_property
-    def start_box(self) -> Boxes:
+    def start_box(self) -> placement.Boxes:
         """Box around the start that stays free of obstacles."""
         return _around(np.zeros(2), self.spec.start.clearance_m)
 
@@ -144,7 +129,7 @@ def generate(
         spec=spec,
         bounds=bounds,
         counts=_draw_counts(spec, seed),
-        ring_m=(spec.goal.min_distance_m, zone_radius_m(spec, zone)),
+        ring_m=(spec.goal.min_distance_m, placement.zone_radius_m(spec, zone)),
         vehicle_width_m=vehicle_width_m,
     )
     # A fixed goal outside the zone fails in every layout, so test it once.
@@ -153,13 +138,13 @@ def generate(
         _rng(seed, stream) for stream in (_Stream.STATIC, _Stream.GOAL, _Stream.MOVING)
     )
     # The failure with the most progress explains best what is missing.
-    failure = NoRoomError("", -1)
+    failure = placement.NoRoomError("", -1)
     for _ in range(LAYOUTS):
         try:
             static, standing, statics, meshes = _draw_static(static_rng, request)
             goal = _draw_reachable_goal(goal_rng, request, static, standing)
             moving, tours = _draw_moving(moving_rng, request, standing)
-        except NoRoomError as error:
+        except placement.NoRoomError as error:
             failure = max(failure, error, key=lambda each: each.progress)
             continue
         return Arena(
@@ -197,9 +182,9 @@ def free_area_fraction(arena: Arena) -> float:
     """Return the share of the floor not covered by static obstacles, seen from above."""
     b, n = arena.bounds, arena.n_static
     if arena.statics is not None:  # Parts of one asset may overlap.
-        return free_share(b, arena.obstacles, n)
+        return placement.free_share(b, arena.obstacles, n)
     floor = (b.north_max - b.north_min) * (b.east_max - b.east_min)
-    return 1.0 - float(footprint_areas(arena.obstacles)[:n].sum()) / floor
+    return 1.0 - float(placement.footprint_areas(arena.obstacles)[:n].sum()) / floor
 
 
 def _rng(seed: int, stream: _Stream) -> np.random.Generator:
@@ -234,7 +219,7 @@ def _draw_rooms(
     if not spec.rooms.drawn:
         return None
     # The passage search works on a raster, so a door needs more than the vehicle's width.
-    least = least_gap_m(bounds, vehicle_width_m)
+    least = placement.least_gap_m(bounds, vehicle_width_m)
     if spec.rooms.door_width_m[0] < least:
         raise UsageError(
             f"arena {name!r}: rooms.door_width_m = {list(spec.rooms.door_width_m)}: accepted: value"
@@ -243,7 +228,7 @@ def _draw_rooms(
     keep_off = _around(np.zeros(2), spec.start.clearance_m)
     if spec.goal.fixed is not None:
         goal = _around(np.array(spec.goal.fixed), spec.goal.clearance_m)
-        keep_off = join(keep_off, goal)
+        keep_off = placement.join(keep_off, goal)
     return draw_plan(_rng(seed, _Stream.ROOMS), spec, bounds, keep_off, name)
 
 
@@ -260,7 +245,7 @@ def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: f
         )
 
 
-def _draw_height(request: _Request, seed: int, goal: Floats) -> float | None:
+def _draw_height(request: _Request, seed: int, goal: placement.Floats) -> float | None:
     spec = request.spec
     if spec.goal.height_m is None:
         return None
@@ -273,7 +258,7 @@ def _draw_height(request: _Request, seed: int, goal: Floats) -> float | None:
 
 def _draw_static(
     rng: np.random.Generator, request: _Request
-) -> tuple[Obstacles, Boxes, Statics | None, tuple[PlacedMesh, ...]]:
+) -> tuple[Obstacles, placement.Boxes, Statics | None, tuple[PlacedMesh, ...]]:
     """Draw and place the static obstacles; return bounding boxes, groups and meshes, too."""
     spec, (n, _) = request.spec, request.counts
     bodies: AssetBodies | Things
@@ -285,26 +270,32 @@ def _draw_static(
     # Obstacles keep off start, goal, walls and doors.
     keep_off = request.start_box
     if spec.goal.fixed is not None:
-        keep_off = join(keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m))
+        keep_off = placement.join(
+            keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m)
+        )
     if len(request.walls):
-        keep_off = join(keep_off, bounding_boxes(request.walls).grown(spec.min_clearance_m))
+        keep_off = placement.join(
+            keep_off, placement.bounding_boxes(request.walls).grown(spec.min_clearance_m)
+        )
     if request.plan is not None:
-        keep_off = join(keep_off, request.plan.grown_passages(spec.rooms.door_clearance_m))
+        keep_off = placement.join(
+            keep_off, request.plan.grown_passages(spec.rooms.door_clearance_m)
+        )
     try:
-        places = place_all(
+        places = placement.place_all(
             rng, bodies.bounding_half, keep_off, request.bounds, spec.min_clearance_m
         )
-    except NoRoomError as error:
+    except placement.NoRoomError as error:
         floor = spec.size.north_m * spec.size.east_m
         taken = 4.0 * np.prod(bodies.bounding_half + spec.min_clearance_m / 2.0, axis=1).sum()
-        raise NoRoomError(
+        raise placement.NoRoomError(
             f"too dense: {error.progress} of {n} static obstacles found a place, none for the next "
-            f"in {TRIES} tries; with half of min_clearance_m {spec.min_clearance_m:g} around each, "
-            f"all would take {taken / floor:.0%} of the {spec.size.north_m:g} x "
+            f"in {placement.TRIES} tries; with half of min_clearance_m {spec.min_clearance_m:g} "
+            f"around each, all would take {taken / floor:.0%} of the {spec.size.north_m:g} x "
             f"{spec.size.east_m:g} m floor",
             error.progress,
         ) from None
-    standing = Boxes(places, bodies.bounding_half)
+    standing = placement.Boxes(places, bodies.bounding_half)
     static = bodies.at(places)
     meshes = bodies.meshes_at(places) if isinstance(bodies, Things) else ()
     if request.ground is not None:
@@ -313,42 +304,44 @@ def _draw_static(
 
 
 def _draw_reachable_goal(
-    rng: np.random.Generator, request: _Request, static: Obstacles, standing: Boxes
-) -> Floats:
+    rng: np.random.Generator, request: _Request, static: Obstacles, standing: placement.Boxes
+) -> placement.Floats:
     """Return the fixed goal, or draw a free and reachable one."""
     spec, progress = request.spec, len(static)
     keep_off = standing.grown(spec.goal.clearance_m)
-    boxes: Boxes | None = standing
+    boxes: placement.Boxes | None = standing
     clearance_m = spec.goal.clearance_m
     # Behind the last gate, so that the flight passes all gates.
     if len(request.openings):
-        keep_off = join(keep_off, behind(request.openings, request.bounds, clearance_m))
+        keep_off = placement.join(keep_off, behind(request.openings, request.bounds, clearance_m))
         # The vehicle passes through openings: only boxes of full height block it.
         static, boxes = _concatenate(static, closed_from_above(request.walls)), None
     elif request.plan is not None:
-        around = join(bounding_boxes(request.walls), request.plan.passages())
-        keep_off = join(keep_off, around.grown(clearance_m))
+        around = placement.join(placement.bounding_boxes(request.walls), request.plan.passages())
+        keep_off = placement.join(keep_off, around.grown(clearance_m))
         # Lintels hang above the doors, so they do not block the passage.
         static, boxes = _concatenate(static, standing_on_the_floor(request.walls)), None
     for _ in range(GOALS_PER_LAYOUT):
         goal = (
-            draw_goal(rng, request.bounds, keep_off, request.ring_m, spec.goal.clearance_m)
+            placement.draw_goal(
+                rng, request.bounds, keep_off, request.ring_m, spec.goal.clearance_m
+            )
             if spec.goal.fixed is None
             else np.array(spec.goal.fixed)
         )
         if goal is None:
             near, far = request.ring_m
-            raise NoRoomError(
+            raise placement.NoRoomError(
                 f"no free place for the goal {near:g} to {far:g} m from the start, "
                 f"goal.clearance_m {spec.goal.clearance_m:g}, among {len(static)} static obstacles",
                 progress,
             )
-        if passage_exists(
+        if placement.passage_exists(
             request.bounds, static, goal, request.vehicle_width_m, boxes, request.hills
         ):
             return goal
     hills = "" if request.ground is None else " and hills"
-    raise NoRoomError(
+    raise placement.NoRoomError(
         f"no way {request.vehicle_width_m:g} m wide from the start to the goal among "
         f"{len(static)} static obstacles{hills}",
         progress,
@@ -356,22 +349,22 @@ def _draw_reachable_goal(
 
 
 def _draw_moving(
-    rng: np.random.Generator, request: _Request, standing: Boxes
+    rng: np.random.Generator, request: _Request, standing: placement.Boxes
 ) -> tuple[Obstacles, tuple[Tour, ...]]:
     """Draw the moving obstacles at time 0, and their tours, around the static bounding boxes."""
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
     gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m
     if len(request.walls):
-        standing = join(standing, bounding_boxes(request.walls))
+        standing = placement.join(standing, placement.bounding_boxes(request.walls))
     always = request.start_box
     if request.plan is not None:  # Moving obstacles stay in their rooms.
-        always = join(always, request.plan.grown_passages(spec.rooms.door_clearance_m))
-    on_the_way = join(always, standing.grown(walking_gap))
+        always = placement.join(always, request.plan.grown_passages(spec.rooms.door_clearance_m))
+    on_the_way = placement.join(always, standing.grown(walking_gap))
     # The gap at time 0 may be larger than the gap on the way.
     at_first = on_the_way
     if gap > walking_gap:
-        at_first = join(always, standing.grown(gap))
+        at_first = placement.join(always, standing.grown(gap))
     tours = draw_tours(
         rng,
         bodies.bounding_half,
@@ -382,7 +375,7 @@ def _draw_moving(
         spec.moving,
     )
     if len(tours) < n:
-        raise NoRoomError(
+        raise placement.NoRoomError(
             f"too dense: {len(tours)} of {n} moving obstacles found a place and a tour among "
             f"{len(standing)} static ones",
             len(standing) + len(tours),
@@ -391,9 +384,9 @@ def _draw_moving(
     return bodies.at(places), tuple(tours)
 
 
-def _around(center: Floats, clearance: float) -> Boxes:
+def _around(center: placement.Floats, clearance: float) -> placement.Boxes:
     """Return the box that extends `clearance` [m] from a point."""
-    return Boxes(center[None], np.full((1, 2), clearance))
+    return placement.Boxes(center[None], np.full((1, 2), clearance))
 
 
 def _concatenate(static: Obstacles, moving: Obstacles) -> Obstacles:

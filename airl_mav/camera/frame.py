@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.projections import (
-    MOST_COEFFICIENT,
-    PROJECTIONS,
-    UNDISTORTED,
-    CameraKind,
-    Distortion,
-    Projection,
-    shape_of,
-)
+from airl_mav.profiles import projections
 
 _MODES: Final = {1: "L", 3: "RGB"}
 
@@ -67,20 +59,22 @@ def image_of(data: bytes, height: int, width: int, channels: int) -> NDArray[np.
     return np.ascontiguousarray(pixels.reshape(height, width, channels))
 
 
-_LETTERS: Final[dict[CameraKind, str]] = {"depth": "D", "rgb": "R", "grey": "G"}
+_LETTERS: Final[dict[projections.CameraKind, str]] = {"depth": "D", "rgb": "R", "grey": "G"}
 
 
-def _magics(first: str, kinds: Iterable[CameraKind], letter: str) -> dict[Camera, bytes]:
+def _magics(
+    first: str, kinds: Iterable[projections.CameraKind], letter: str
+) -> dict[Camera, bytes]:
     """Return magic numbers: format, kind, letter of the projection by an attribute, version 1."""
     return {
         (kind, name): f"{first}{_LETTERS[kind]}{getattr(model, letter)}1".encode()
         for kind in kinds
-        for name, model in PROJECTIONS.items()
+        for name, model in projections.PROJECTIONS.items()
         if getattr(model, letter)
     }
 
 
-Camera = tuple[CameraKind, Projection]
+Camera = tuple[projections.CameraKind, projections.Projection]
 
 MAGICS: Final = _magics("A", _LETTERS, "magic")
 """Magic numbers of a frame: air-learning depth, RGB or grey; projection; version 1."""
@@ -98,7 +92,7 @@ _DISTORTED: Final = {
 _CAMERA_OF = {magic: camera for camera, magic in MAGICS.items()}
 _JPEG_CAMERA_OF = {magic: camera for camera, magic in JPEG_MAGICS.items()}
 
-_PIXELS: dict[CameraKind, tuple[str, int]] = {
+_PIXELS: dict[projections.CameraKind, tuple[str, int]] = {
     "depth": ("<u2", 2),
     "rgb": ("u1", 3),
     "grey": ("u1", 1),
@@ -206,7 +200,7 @@ class Frame:
         """Return the wire form of the main image only."""
         k = self.intrinsics
         magic = (MAGICS if self.jpeg is None else JPEG_MAGICS)[k.kind, k.projection]
-        distorts = k.distortion != UNDISTORTED
+        distorts = k.distortion != projections.UNDISTORTED
         header = _HEADER.pack(
             _DISTORTED[magic] if distorts else magic,
             *(self.sequence, self.capture_time_us),
@@ -240,7 +234,11 @@ class Frame:
             raise FrameError(f"magic {magic!r}, expected {known}")
         kind, projection = camera
         number, size = _PIXELS[kind]
-        compressed, distortion, begins = plain in _JPEG_CAMERA_OF, UNDISTORTED, _HEADER.size
+        compressed, distortion, begins = (
+            plain in _JPEG_CAMERA_OF,
+            projections.UNDISTORTED,
+            _HEADER.size,
+        )
         if plain != magic:
             distortion, begins = _coefficients(data), _HEADER.size + _COEFFICIENTS.size
         if not compressed and len(data) != begins + size * width * height:
@@ -250,7 +248,7 @@ class Frame:
         # Written so that NaN fails.
         if not (LEAST_PX <= focal <= MOST_PX and abs(cx) <= MOST_PX and abs(cy) <= MOST_PX):
             raise FrameError(f"focal {focal}, centre {cx}, {cy}: no {projection} camera")
-        if (problem := PROJECTIONS[projection].problem(width, focal)) is not None:
+        if (problem := projections.PROJECTIONS[projection].problem(width, focal)) is not None:
             raise FrameError(problem)
         lens = Intrinsics(width, height, focal, cx, cy, projection, kind, distortion)
         if compressed:
@@ -262,16 +260,18 @@ class Frame:
             return cls(sequence, time_us, decoded, lens, jpeg)
         # A read-only view of the message, without a copy.
         pixels = np.frombuffer(data, number, offset=begins)
-        return cls(sequence, time_us, pixels.reshape(shape_of(kind, height, width)), lens)
+        return cls(
+            sequence, time_us, pixels.reshape(projections.shape_of(kind, height, width)), lens
+        )
 
 
-def _coefficients(data: bytes) -> Distortion:
+def _coefficients(data: bytes) -> projections.Distortion:
     """Return the coefficients after a header. Raises FrameError."""
     if len(data) < _HEADER.size + _COEFFICIENTS.size:
         raise FrameError(f"{len(data)} bytes are too short for the coefficients of a lens")
     k1, k2, k3, k4 = _COEFFICIENTS.unpack_from(data, _HEADER.size)
     # Written so that NaN fails.
-    if not all(abs(each) <= MOST_COEFFICIENT for each in (k1, k2, k3, k4)):
+    if not all(abs(each) <= projections.MOST_COEFFICIENT for each in (k1, k2, k3, k4)):
         raise FrameError(f"coefficients {k1}, {k2}, {k3}, {k4}: no fisheye")
     return k1, k2, k3, k4
 

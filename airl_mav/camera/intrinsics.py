@@ -9,15 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.profiles.projections import (
-    PROJECTIONS,
-    UNDISTORTED,
-    CameraKind,
-    Distortion,
-    Projection,
-    ProjectionModel,
-    shape_of,
-)
+from airl_mav.profiles import projections
 
 if TYPE_CHECKING:
     from airl_mav.profiles.camera import Camera
@@ -39,9 +31,9 @@ class Intrinsics:
     the middle of its image."""
     cx: float
     cy: float
-    projection: Projection = "pinhole"
-    kind: CameraKind = "depth"
-    distortion: Distortion = UNDISTORTED
+    projection: projections.Projection = "pinhole"
+    kind: projections.CameraKind = "depth"
+    distortion: projections.Distortion = projections.UNDISTORTED
 
     @classmethod
     def from_fov(
@@ -49,16 +41,16 @@ class Intrinsics:
         width: int,
         height: int,
         horizontal_fov: float,
-        projection: Projection = "pinhole",
-        kind: CameraKind = "depth",
-        distortion: Distortion = UNDISTORTED,
+        projection: projections.Projection = "pinhole",
+        kind: projections.CameraKind = "depth",
+        distortion: projections.Distortion = projections.UNDISTORTED,
     ) -> Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad].
 
         The maximum is pi for a pinhole, 2 pi for a cylinder and 190 degrees for a fisheye. The
         field of view spans the image from edge to edge.
         """
-        focal = PROJECTIONS[projection].focal(width, horizontal_fov, distortion)
+        focal = projections.PROJECTIONS[projection].focal(width, horizontal_fov, distortion)
         # Pixel centres are integers, so the middle of the image is (n - 1) / 2.
         cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
         return cls(width, height, focal, cx, cy, projection, kind, distortion)
@@ -78,7 +70,7 @@ class Intrinsics:
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of its images: (h, w) of depth, (h, w, channels) of colour."""
-        return shape_of(self.kind, self.height, self.width)
+        return projections.shape_of(self.kind, self.height, self.width)
 
     @property
     def dtype(self) -> type[np.uint16] | type[np.uint8]:
@@ -86,9 +78,9 @@ class Intrinsics:
         return np.uint16 if self.kind == "depth" else np.uint8
 
     @property
-    def model(self) -> ProjectionModel:
+    def model(self) -> projections.ProjectionModel:
         """Projection of directions to the image."""
-        return PROJECTIONS[self.projection]
+        return projections.PROJECTIONS[self.projection]
 
     @property
     def horizontal_fov_rad(self) -> float:

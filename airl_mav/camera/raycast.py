@@ -25,102 +25,81 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera import primitives, projection
 from airl_mav.camera.bvh import Meshes, is_owned, raised
 from airl_mav.camera.meshes import Faces, draw_meshes
-from airl_mav.camera.primitives import (
-    BOX,
-    CYLINDER,
-    TINY,
-    Ids,
-    Rectangles,
-    draw_box,
-    draw_cylinder,
-    draw_room,
-    draw_sphere,
-    turned,
-)
-from airl_mav.camera.projection import (
-    MIN_DEPTH_M,
-    Bent,
-    Image,
-    ImageProjection,
-    LensConstants,
-    Line,
-    Lines,
-    Optics,
-    Pose,
-    ProjectedBody,
-    Scene,
-    cut,
-    cylinder_span,
-    rectangle_of,
-)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 
 @borrowing_kernel
-def body_of(scene: Scene, axes: Pose, camera: Vec, i: int) -> ProjectedBody:
+def body_of(
+    scene: projection.Scene, axes: projection.Pose, camera: Vec, i: int
+) -> projection.ProjectedBody:
     """Return an obstacle in the world's axes."""
     center, half_size = scene.center, scene.half_size
     offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
     half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
-    pose = Pose(axes.forward, axes.across, axes.along, offset)
-    return ProjectedBody(i, scene.shape[i], half, scene.yaw[i], pose)
+    pose = projection.Pose(axes.forward, axes.across, axes.along, offset)
+    return projection.ProjectedBody(i, scene.shape[i], half, scene.yaw[i], pose)
 
 
 @borrowing_kernel
 def _draw_obstacle(
-    out: Image, ids: Ids | None, drawn_in: Rectangles | None, optics: Optics, body: ProjectedBody
+    out: projection.Image,
+    ids: primitives.Ids | None,
+    drawn_in: primitives.Rectangles | None,
+    optics: projection.Optics,
+    body: projection.ProjectedBody,
 ) -> bool:
     """Draw one obstacle; return True if the camera is inside."""
     cos, sin = 1.0, 0.0
     shape, world, half, view = body.shape, body.pose, body.half, optics.lens
-    if shape == BOX:
+    if shape == primitives.BOX:
         cos, sin = math.cos(body.yaw), math.sin(body.yaw)
-    elif shape == CYLINDER:
+    elif shape == primitives.CYLINDER:
         # Its bounding box is narrowest in the image when turned towards the camera.
         distance = math.hypot(world.center[0], world.center[1])
         if distance > 0.0:
             cos, sin = world.center[0] / distance, world.center[1] / distance
-    pose = turned(world, cos, sin)
-    sphere = shape != BOX and shape != CYLINDER
+    pose = primitives.turned(world, cos, sin)
+    sphere = shape != primitives.BOX and shape != primitives.CYLINDER
     turns = 0
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
     if view.cylindrical:
         # A body behind the camera may appear at both ends of the image.
         turns = 1
-        span = cylinder_span(out, view, pose, half, sphere)
+        span = projection.cylinder_span(out, view, pose, half, sphere)
     else:
-        rectangle = rectangle_of(out, optics.bent, view, pose, half, sphere)
-    own = ProjectedBody(body.number, shape, half, body.yaw, pose)
+        rectangle = projection.rectangle_of(out, optics.bent, view, pose, half, sphere)
+    own = projection.ProjectedBody(body.number, shape, half, body.yaw, pose)
     for turn in range(-turns, turns + 1):
         if view.cylindrical:
-            rectangle = cut(out, view, span, turn)
+            rectangle = projection.cut(out, view, span, turn)
         if drawn_in is not None:
             for side in range(4):
                 drawn_in[turn + turns, side] = rectangle[side]
         if rectangle[0] >= rectangle[1] or rectangle[2] >= rectangle[3]:
             continue
         inside: bool
-        if shape == BOX:
-            inside = draw_box(out, ids, optics, own, rectangle)
-        elif shape == CYLINDER:
-            inside = draw_cylinder(out, ids, optics, own, rectangle)
+        if shape == primitives.BOX:
+            inside = primitives.draw_box(out, ids, optics, own, rectangle)
+        elif shape == primitives.CYLINDER:
+            inside = primitives.draw_cylinder(out, ids, optics, own, rectangle)
         else:
-            inside = draw_sphere(out, ids, optics, own, rectangle)
+            inside = primitives.draw_sphere(out, ids, optics, own, rectangle)
         if inside:
             return True
     return False
 
 
 @borrowing_kernel
-def invert(out: Image) -> None:
+def invert(out: projection.Image) -> None:
     """Convert inverse depth to depth [m], in place."""
     zero, one = np.float32(0.0), np.float32(1.0)
     # The limits keep the quotient finite and raise near depths to MIN_DEPTH_M.
-    least, most = np.float32(TINY), np.float32(1.0 / MIN_DEPTH_M)
+    least, most = np.float32(primitives.TINY), np.float32(1.0 / projection.MIN_DEPTH_M)
     for v in range(out.shape[0]):
         row = out[v]
         for u in range(len(row)):
@@ -130,7 +109,7 @@ def invert(out: Image) -> None:
 
 
 @borrowing_kernel
-def blank(out: Image, bent: Bent | None) -> None:
+def blank(out: projection.Image, bent: projection.Bent | None) -> None:
     """Write 0 into pixels of a tabled projection outside the field of view."""
     if bent is None:
         return
@@ -143,11 +122,11 @@ def blank(out: Image, bent: Bent | None) -> None:
 
 @borrowing_kernel
 def aim(
-    lines: Lines,
-    xs: Line,
+    lines: projection.Lines,
+    xs: projection.Line,
     quaternion: Quat | NDArray[np.float64],
-    lens: LensConstants,
-) -> tuple[ImageProjection, Pose]:
+    lens: projection.LensConstants,
+) -> tuple[projection.ImageProjection, projection.Pose]:
     """Write the rays of an image's lines; return the view, and camera axes without a centre.
 
     `lines` (n, 2) receives the components of each line's first ray on the forward axis and the axis
@@ -160,7 +139,7 @@ def aim(
         rotate(q, (0.0, 0.0, 1.0)),
     )
     focal, cx, cy, cylindrical = lens.focal, lens.cx, lens.cy, lens.cylindrical
-    s_min = max(1.0 / lens.range_m, TINY)
+    s_min = max(1.0 / lens.range_m, primitives.TINY)
     nowhere = (0.0, 0.0, 0.0)
     # The lines of a cylinder are columns: across is right, along is down.
     if cylindrical:
@@ -169,23 +148,25 @@ def aim(
             lines[u, 0], lines[u, 1] = math.cos(angle), math.sin(angle)
         for v in range(len(xs)):
             xs[v] = (v - cy) / focal
-        return ImageProjection(focal, cx, cy, s_min, cylindrical), Pose(
+        return projection.ImageProjection(focal, cx, cy, s_min, cylindrical), projection.Pose(
             forward, right, down, nowhere
         )
     for v in range(len(lines)):
         lines[v, 0], lines[v, 1] = 1.0, (v - cy) / focal
     for u in range(len(xs)):
         xs[u] = (u - cx) / focal
-    return ImageProjection(focal, cy, cx, s_min, cylindrical), Pose(forward, down, right, nowhere)
+    return projection.ImageProjection(focal, cy, cx, s_min, cylindrical), projection.Pose(
+        forward, down, right, nowhere
+    )
 
 
 @borrowing_kernel
 def draw_bodies(
-    out: Image,
-    ids: Ids | None,
-    drawn_in: Rectangles | None,
-    optics: Optics,
-    scene: Scene,
+    out: projection.Image,
+    ids: primitives.Ids | None,
+    drawn_in: primitives.Rectangles | None,
+    optics: projection.Optics,
+    scene: projection.Scene,
     meshes: Meshes | None,
     faces: Faces | None,
 ) -> int:
@@ -202,8 +183,8 @@ def draw_bodies(
         -0.5 * bounds[4] - camera[2],
     )
     half_room = (0.5 * (bounds[1] - bounds[0]), 0.5 * (bounds[3] - bounds[2]), 0.5 * bounds[4])
-    pose = Pose(axes.forward, axes.across, axes.along, room)
-    draw_room(out, ids, optics, pose, half_room, bounds[5] > 0.0)
+    pose = projection.Pose(axes.forward, axes.across, axes.along, room)
+    primitives.draw_room(out, ids, optics, pose, half_room, bounds[5] > 0.0)
     for i in range(len(scene.shape)):
         # A mesh is drawn in place of its obstacles.
         if is_owned(meshes, i):
@@ -229,11 +210,11 @@ def write_transposed(out: NDArray[Any], drawn: NDArray[Any]) -> None:
 
 @kernel
 def render_depth(
-    out: Image,
+    out: projection.Image,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
-    lens: LensConstants,
-    scene: Scene,
+    lens: projection.LensConstants,
+    scene: projection.Scene,
     meshes: Meshes | None,
 ) -> None:
     """Render the depth image of an arena.
@@ -258,10 +239,10 @@ def render_depth(
     view, axes = aim(lines, xs, quaternion, lens)
     # Columns of a cylinder are drawn into contiguous memory, then transposed into `out`.
     drawn = np.empty((width, height), np.float32) if cylindrical else out
-    optics = Optics(lines, xs, bent, view, axes, camera)
+    optics = projection.Optics(lines, xs, bent, view, axes, camera)
     inside = draw_bodies(drawn, None, None, optics, scene, meshes, None)
     if inside >= 0:
-        out[:, :] = MIN_DEPTH_M
+        out[:, :] = projection.MIN_DEPTH_M
         blank(out, bent)
         return
     invert(drawn)

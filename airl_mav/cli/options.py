@@ -23,14 +23,7 @@ import tyro
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from airl_mav.core.errors import (
-    EXIT_BROKEN,
-    EXIT_INTERRUPTED,
-    EXIT_USAGE,
-    FieldError,
-    UsageError,
-    machine_failure,
-)
+from airl_mav.core import errors
 from airl_mav.core.fields import range_of, validated
 from airl_mav.core.first_start import shown_by
 from airl_mav.core.progress import RichProgress, new_console
@@ -75,8 +68,8 @@ def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Optio
     parsed = tyro.cli(kind, prog=prog, description=inspect.getdoc(model), args=words)
     try:
         return validated(model, dataclasses.asdict(parsed))
-    except FieldError as error:
-        raise UsageError(told(error, words, file, _positionals(model))) from None
+    except errors.FieldError as error:
+        raise errors.UsageError(told(error, words, file, _positionals(model))) from None
 
 
 def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
@@ -93,7 +86,7 @@ def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
 
 
 def told(
-    error: FieldError,
+    error: errors.FieldError,
     words: Sequence[str],
     file: Path | None = None,
     positionals: Sequence[str] = (),
@@ -119,7 +112,7 @@ def _names(model: type[BaseModel]) -> Iterator[str]:
             yield name
 
 
-def _with_options(error: FieldError) -> FieldError:
+def _with_options(error: errors.FieldError) -> errors.FieldError:
     """Return an error whose text names fields by their options: --px4-dir for px4_dir."""
 
     def named(word: re.Match[str]) -> str:
@@ -127,7 +120,7 @@ def _with_options(error: FieldError) -> FieldError:
 
     names = set(_names(Scenario))
     accepted, problem = (_FIELD.sub(named, text) for text in (error.accepted, error.problem))
-    return FieldError(error.field, error.value, accepted, problem)
+    return errors.FieldError(error.field, error.value, accepted, problem)
 
 
 def option_of(field: str) -> str:
@@ -244,21 +237,21 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     except BrokenPipeError:
         # The reader has closed the pipe (`| head`): discard further output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = EXIT_BROKEN
-    except UsageError as error:
+        code = errors.EXIT_BROKEN
+    except errors.UsageError as error:
         _fail("; ".join(filter(None, (str(error), refer(words)))))
-        code = EXIT_USAGE
+        code = errors.EXIT_USAGE
     except SystemExit as rejected:  # By tyro, which has printed why; or after --help.
         if rejected.code and (reference := refer(words)):
             _fail(reference)
         raise
     except OSError as error:
-        if (failure := machine_failure(error)) is None:
+        if (failure := errors.machine_failure(error)) is None:
             raise
         _fail(failure)
-        code = EXIT_BROKEN
+        code = errors.EXIT_BROKEN
     except KeyboardInterrupt:
-        code = EXIT_INTERRUPTED
+        code = errors.EXIT_INTERRUPTED
     sys.exit(code)
 
 
@@ -275,16 +268,16 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
         # On standard error, as programs read standard output.
         with shown_by(lambda: RichProgress(new_console(stderr=True))):
             return int(command.run(options, **more))
-    except FieldError as error:
+    except errors.FieldError as error:
         options_model = type(options)
         file = _scenario_file(options_model, words)
-        raise UsageError(told(error, words, file, _positionals(options_model))) from None
+        raise errors.UsageError(told(error, words, file, _positionals(options_model))) from None
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:
     """Print a thread's error, except for a full disk, which is raised by the next write."""
     error = failed.exc_value
-    if not isinstance(error, OSError) or machine_failure(error) is None:
+    if not isinstance(error, OSError) or errors.machine_failure(error) is None:
         threading.__excepthook__(failed)
 
 
@@ -320,4 +313,6 @@ def check_installed(*extras: str) -> None:
     }
     if lacking:
         names = ", ".join(sorted({name for missing in lacking.values() for name in missing}))
-        raise UsageError(f"not installed: {names}; pip install 'airl-mav[{','.join(lacking)}]'")
+        raise errors.UsageError(
+            f"not installed: {names}; pip install 'airl-mav[{','.join(lacking)}]'"
+        )

@@ -11,16 +11,8 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.cli import shared_options
 from airl_mav.cli.options import check_installed, run_command, scenario_of
-from airl_mav.cli.shared_options import (
-    Gate,
-    Telling,
-    Viewing,
-    Voice,
-    leave,
-    requirements_of,
-    view_of,
-)
 from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
@@ -33,7 +25,7 @@ if TYPE_CHECKING:
     from airl_mav.flight.requirements import Requirement
 
 
-class SitlOptions(Gate, Viewing, Telling, Scenario):
+class SitlOptions(shared_options.Gate, shared_options.Viewing, shared_options.Telling, Scenario):
     """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report.
 
     If the first word ends in .toml, it is a scenario file; options override its values. A run
@@ -65,9 +57,9 @@ OPTIONS = SitlOptions
 
 def run(options: SitlOptions, console: Console | None = None) -> int:
     """Fly the rest, write the report; return 0, 1 (lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
-    voice = Voice(options, "airl-sitl", console)
-    requirements = requirements_of(options, reference=False)
-    view = view_of(options)
+    voice = shared_options.Voice(options, "airl-sitl", console)
+    requirements = shared_options.requirements_of(options, reference=False)
+    view = shared_options.view_of(options)
     scenario = resolve(scenario_of(options))
     film = video_of(options, scenario.scenario, partial(_say, voice.console))
     with voice, film:
@@ -94,7 +86,12 @@ def video_of(
     return shown
 
 
-def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
+def conclude(
+    flown: FlownRun,
+    gate: shared_options.Gate,
+    requirements: Sequence[Requirement],
+    voice: shared_options.Voice,
+) -> int:
     """Print the tables and write the report of the flights; return the verdict's exit status."""
     if not flown.episodes:
         _say(voice.console, f"no episode was finished; logs in {flown.path}")
@@ -108,7 +105,7 @@ def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], v
     run = load(flown.path)
     verdict = verdict_of(run, requirements)
     if flown.ended == "complete":
-        leave(gate, verdict, "airl-sitl")
+        shared_options.leave(gate, verdict, "airl-sitl")
     page = show_report(run, verdict, voice.console, voice.progress)
     voice.finish(
         EXIT_CODES[flown.ended] or verdict.exit_code,

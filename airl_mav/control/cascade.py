@@ -13,18 +13,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from airl_mav.control import loops
 from airl_mav.control.demand import AttitudeDemand, Demand, Gains, RateDemand, TrajectoryDemand
-from airl_mav.control.loops import (
-    Motors,
-    acceleration_control,
-    attitude_setpoint,
-    heading_of,
-    mix,
-    rate_control,
-    rate_setpoint,
-    velocity_control,
-    velocity_setpoint,
-)
 from airl_mav.control.memory import (
     ATTITUDE_SP,
     DGYRO,
@@ -63,7 +53,7 @@ measured."""
 class Output(NamedTuple):
     """Output of the cascade."""
 
-    motors: Motors
+    motors: loops.Motors
     thrust: float
     """Collective 0..1 in the motor commands."""
     attitude: Quat
@@ -226,7 +216,7 @@ def _inner_loops(
 ) -> Output:
     """Fly the position loop's output: attitude setpoint, yaw rate, collective."""
     q_sp, yaw_rate, thrust_sp = published
-    wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
+    wanted = loops.rate_setpoint(q, q_sp, yaw_rate, gains)
     rates_sp, collective = hand_over(wanted, thrust_sp, first, memory)
     motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
     newest_sp = attitude_sp(memory)[0]
@@ -292,8 +282,8 @@ def position_loop(
     """Publish the attitude and thrust that fly the demand."""
     period = POSITION_TICKS * dt
     differentiate(velocity, memory, weights, period)
-    velocity_sp = velocity_setpoint(position, demand.position, demand.velocity, gains)
-    thrust, integral = velocity_control(
+    velocity_sp = loops.velocity_setpoint(position, demand.position, demand.velocity, gains)
+    thrust, integral = loops.velocity_control(
         velocity,
         three(memory, VEL_DOT),
         velocity_sp,
@@ -318,12 +308,12 @@ def _trajectory_loop(
     """Run the position loop, as `position_loop`, with an acceleration."""
     period = POSITION_TICKS * dt
     differentiate(velocity, memory, weights, period)
-    north, east, down = velocity_setpoint(position, demand.position, demand.velocity, gains)
+    north, east, down = loops.velocity_setpoint(position, demand.position, demand.velocity, gains)
     # Without position and velocity the down axis is left to the acceleration.
     if math.isnan(demand.position[2]) and math.isnan(demand.velocity[2]):
         down = math.nan
     velocity_sp = (north, east, down)
-    thrust, integral = acceleration_control(
+    thrust, integral = loops.acceleration_control(
         velocity,
         three(memory, VEL_DOT),
         velocity_sp,
@@ -358,10 +348,10 @@ def _publish(
     """Store the position loop's output: attitude, yaw rate and collective."""
     if math.isnan(yaw):
         # An uncommanded heading keeps the present one.
-        cos_yaw, sin_yaw = heading_of(q)
+        cos_yaw, sin_yaw = loops.heading_of(q)
     else:
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-    q_sp = attitude_setpoint(thrust, cos_yaw, sin_yaw)
+    q_sp = loops.attitude_setpoint(thrust, cos_yaw, sin_yaw)
     for i in range(3):
         memory[VEL_INT + i] = integral[i]
         memory[VELOCITY_SP + i] = velocity_sp[i]
@@ -381,10 +371,10 @@ def _rate_loop(
     gains: Gains,
     weights: Filters,
     dt: float,
-) -> Motors:
+) -> loops.Motors:
     """Return the motor commands for the body rates, with a collective 0..1."""
     torque = torque_setpoint(omega, rates_sp, memory, gains, weights, dt)
-    motors, missing = mix(collective, torque, gains)
+    motors, missing = loops.mix(collective, torque, gains)
     for i in range(3):
         memory[SAT + i] = missing[i]
     return motors
@@ -406,7 +396,7 @@ def torque_setpoint(
         memory[GYRO + i], memory[GYRO_NEWER + i], memory[GYRO_OLDER + i] = rate, held, newer
         slope = (rate - before) / dt
         memory[DGYRO + i] += weights.angular_acceleration * (slope - memory[DGYRO + i])
-    torque, integral = rate_control(
+    torque, integral = loops.rate_control(
         three(memory, GYRO),
         three(memory, DGYRO),
         rates_sp,

@@ -16,26 +16,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.cascade import (
-    POSITION_TICKS,
-    Filters,
-    attitude_sp,
-    differentiate,
-    filters,
-    hand_over,
-    position_loop,
-    start,
-    torque_setpoint,
-)
+from airl_mav.control import cascade, loops
 from airl_mav.control.demand import Demand, Gains
-from airl_mav.control.loops import (
-    allocate,
-    desaturate,
-    heading_of,
-    rates_towards,
-    reduced_attitude,
-    weighted_turn,
-)
 from airl_mav.control.memory import (
     ATTITUDE_SP,
     MEMORY_SIZE,
@@ -49,15 +31,7 @@ from airl_mav.control.memory import (
 )
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
-from airl_mav.envs.arena_batch import (
-    NOTHING,
-    ArenaBatch,
-    clearance,
-    move_all_obstacles,
-    move_obstacles,
-    relief_of,
-    touches,
-)
+from airl_mav.envs import arena_batch
 from airl_mav.envs.decision import DecisionBatch, FrameTimes, Timing, new_decision, next_stretch
 from airl_mav.envs.fleet import (
     AIRFRAME,
@@ -131,7 +105,7 @@ _TIMEOUT = int(FlightStatus.TIMEOUT)
 
 def advance(
     fleet: Fleet,
-    arenas: ArenaBatch,
+    arenas: arena_batch.ArenaBatch,
     ticks: NDArray[np.int64],
     vehicle: FleetConstants,
     rules: Rules,
@@ -164,13 +138,13 @@ def advance(
         np.zeros((n, 0, 3)) if air is None else air,
         nothing,
     )
-    move_all_obstacles(arenas, fleet.time_us)
+    arena_batch.move_all_obstacles(arenas, fleet.time_us)
 
 
 @large_kernel
 def fly(
     fleet: Fleet,
-    arenas: ArenaBatch,
+    arenas: arena_batch.ArenaBatch,
     todo: NDArray[np.int64],
     vehicle: FleetConstants,
     rules: Rules,
@@ -182,7 +156,7 @@ def fly(
     A vehicle whose decision has events flies until its end, or until Python is needed; other
     vehicles fly `todo` ticks. Obstacles are only moved for contact checks.
     """
-    weights, kept = filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
+    weights, kept = cascade.filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
     # Allocated here with constant sizes, so that the compiler knows that rows do not overlap.
     state, spare = np.zeros((ROWS, LANES)), np.zeros((MEMORY_SIZE, LANES))
     who, left = np.full(LANES, _NOBODY), np.zeros(LANES, np.int64)
@@ -212,7 +186,7 @@ def fly(
         for j in range(LANES):
             i = who[j]
             if i != _NOBODY:
-                here, hit = vec(state, POSITION, j), NOTHING
+                here, hit = vec(state, POSITION, j), arena_batch.NOTHING
                 # Same order as `flight.judge`: move, contact, verdict.
                 fleet.time_us[i] += TICK_US
                 # Contact is impossible until the combined motion exceeds the clearance.
@@ -295,7 +269,7 @@ def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
             state[WANTED + axis, j] = fleet.setpoint[i, axis]
         fleet.repeat_us[i] += REPEAT_US
         return
-    c, s = heading_of(quat(state, ATTITUDE, j))
+    c, s = loops.heading_of(quat(state, ATTITUDE, j))
     forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
     fleet.velocity_ned[i, 0] = c * forward - s * right
     fleet.velocity_ned[i, 1] = s * forward + c * right
@@ -320,7 +294,7 @@ def _outer_loops(
     who: NDArray[np.int64],
     aloft: int,
     gains: Gains,
-    weights: Filters,
+    weights: cascade.Filters,
 ) -> bool:
     """Run the first half of `cascade_tick` in every lane, up to the attitude loop's setpoint.
 
@@ -332,7 +306,7 @@ def _outer_loops(
     for j in range(state.shape[1]):
         memory = state[MEMORY:ROWS, j]
         by_rates += who[j] != _NOBODY and state[BY_RATES, j] != 0.0
-        first = start(vec(state, VELOCITY, j), vec(state, RATES, j), memory, weights)
+        first = cascade.start(vec(state, VELOCITY, j), vec(state, RATES, j), memory, weights)
         state[FIRST, j] = 1.0 if first else 0.0
         due += who[j] != _NOBODY and memory[WAIT] == 0.0
         _publish(state, j)
@@ -346,7 +320,7 @@ def _outer_loops(
         for j in range(state.shape[1]):
             demand = Demand(NAN3, vec(state, WANTED, j), math.nan, state[YAW_RATE, j])
             p, v, q = vec(state, POSITION, j), vec(state, VELOCITY, j), quat(state, ATTITUDE, j)
-            position_loop(p, v, q, demand, state[MEMORY:ROWS, j], gains, weights, TICK_S)
+            cascade.position_loop(p, v, q, demand, state[MEMORY:ROWS, j], gains, weights, TICK_S)
         for j in range(state.shape[1]):
             if state[MEMORY + WAIT, j] != 0.0:
                 if kept:
@@ -354,11 +328,11 @@ def _outer_loops(
             elif state[BY_RATES, j] != 0.0:
                 _restore(state, spare, j)
                 # Body rates skip the position loop, but its velocity filter must not stop.
-                velocity, period = vec(state, VELOCITY, j), POSITION_TICKS * TICK_S
-                differentiate(velocity, state[MEMORY:ROWS, j], weights, period)
-                state[MEMORY + WAIT, j] = POSITION_TICKS
+                velocity, period = vec(state, VELOCITY, j), cascade.POSITION_TICKS * TICK_S
+                cascade.differentiate(velocity, state[MEMORY:ROWS, j], weights, period)
+                state[MEMORY + WAIT, j] = cascade.POSITION_TICKS
             else:
-                state[MEMORY + WAIT, j] = POSITION_TICKS
+                state[MEMORY + WAIT, j] = cascade.POSITION_TICKS
                 # In the first tick the inner loops use the setpoint of this tick.
                 if state[FIRST, j] != 0.0:
                     _publish(state, j)
@@ -373,31 +347,33 @@ def _restore(state: State, spare: NDArray[np.float64], j: int) -> None:
 
 
 @kernel
-def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Filters) -> None:
+def _inner_loops(
+    state: State, who: NDArray[np.int64], gains: Gains, weights: cascade.Filters
+) -> None:
     """Run the second half of `cascade_tick` in every lane, up to the motor commands.
 
     Arguments as in `_outer_loops`.
     """
     for j in range(state.shape[1]):
         q, q_sp = quat(state, ATTITUDE, j), quat(state, PUBLISHED, j)
-        reduced, state[HALF_TURN, j] = reduced_attitude(q, q_sp)
+        reduced, state[HALF_TURN, j] = loops.reduced_attitude(q, q_sp)
         for k in range(4):
             state[REDUCED + k, j] = reduced[k]
         state[MEMORY + WAIT, j] -= 1.0
     for j in range(state.shape[1]):
         # A separate loop: `weighted_turn` calls functions without a vector form.
-        state[HALF_TURN, j] = weighted_turn(state[HALF_TURN, j], gains)
+        state[HALF_TURN, j] = loops.weighted_turn(state[HALF_TURN, j], gains)
     for j in range(state.shape[1]):
         memory, reduced = state[MEMORY:ROWS, j], quat(state, REDUCED, j)
         yaw_rate = state[PUBLISHED_YAW_RATE, j]
-        wanted = rates_towards(
+        wanted = loops.rates_towards(
             quat(state, ATTITUDE, j), reduced, state[HALF_TURN, j], yaw_rate, gains
         )
         first = state[FIRST, j] != 0.0
-        rates_sp, collective = hand_over(wanted, state[PUBLISHED_THRUST, j], first, memory)
+        rates_sp, collective = cascade.hand_over(wanted, state[PUBLISHED_THRUST, j], first, memory)
         omega = vec(state, RATES, j)
-        torque = torque_setpoint(omega, rates_sp, memory, gains, weights, TICK_S)
-        motors, fits = allocate(collective, torque, gains)
+        torque = cascade.torque_setpoint(omega, rates_sp, memory, gains, weights, TICK_S)
+        motors, fits = loops.allocate(collective, torque, gains)
         state[FITS, j], state[COLLECTIVE, j] = 1.0 if fits else 0.0, collective
         for axis in range(3):
             state[TORQUE + axis, j] = torque[axis]
@@ -407,7 +383,7 @@ def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Fi
     # Desaturation is rare and not vectorized.
     for j in range(state.shape[1]):
         if state[FITS, j] == 0.0 and who[j] != _NOBODY:
-            motors, missing = desaturate(state[COLLECTIVE, j], vec(state, TORQUE, j), gains)
+            motors, missing = loops.desaturate(state[COLLECTIVE, j], vec(state, TORQUE, j), gains)
             for axis in range(3):
                 state[MEMORY + SAT + axis, j] = missing[axis]
             for k in range(4):
@@ -445,7 +421,7 @@ def _keep_rates(state: State, who: NDArray[np.int64]) -> None:
 @kernel
 def _publish(state: State, j: int) -> None:
     """Store the setpoints of the inner loops for this tick."""
-    q_sp, yaw_rate, thrust = attitude_sp(state[MEMORY:ROWS, j])
+    q_sp, yaw_rate, thrust = cascade.attitude_sp(state[MEMORY:ROWS, j])
     for k in range(4):
         state[PUBLISHED + k, j] = q_sp[k]
     state[PUBLISHED_YAW_RATE, j], state[PUBLISHED_THRUST, j] = yaw_rate, thrust
@@ -509,7 +485,7 @@ def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules
         away += (here[2] - goal[2]) ** 2
     if away < rules.goal_radius**2:
         return _SUCCESS
-    if hit != NOTHING:
+    if hit != arena_batch.NOTHING:
         return _COLLISION
     if battery <= 0.0:
         return _BATTERY
@@ -518,19 +494,21 @@ def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules
 
 @kernel
 def _contact(
-    arenas: ArenaBatch, i: int, position: Vec, time_us: int, vehicle: FleetConstants
+    arenas: arena_batch.ArenaBatch, i: int, position: Vec, time_us: int, vehicle: FleetConstants
 ) -> tuple[float, int]:
     """Return a lower bound of vehicle i's clearance [m], and the touched object."""
-    move_obstacles(arenas, i, time_us)
+    arena_batch.move_obstacles(arenas, i, time_us)
     bounds, count = arenas.bounds[i], arenas.n_obstacles[i]
     shape, center = arenas.shape[i], arenas.center[i]
     half_size, yaw = arenas.half_size[i], arenas.yaw[i]
     radius, half_height = vehicle.radius, vehicle.half_height
-    relief = relief_of(arenas, i)
-    room = clearance(position, radius, half_height, bounds, count, center, half_size, relief)
+    relief = arena_batch.relief_of(arenas, i)
+    room = arena_batch.clearance(
+        position, radius, half_height, bounds, count, center, half_size, relief
+    )
     # The exact test runs only where the lower bound permits a contact.
     if room > _ROUNDING_M:
-        return room, NOTHING
-    return room, touches(
+        return room, arena_batch.NOTHING
+    return room, arena_batch.touches(
         position, radius, half_height, bounds, count, shape, center, half_size, yaw, relief
     )

@@ -20,6 +20,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.faults import Fault
+from airl_mav.policy import observation_spec
 from airl_mav.policy.images import (
     BAND_M,
     NEAREST_M,
@@ -34,12 +35,6 @@ from airl_mav.policy.images import (
     goes_round,
 )
 from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
-from airl_mav.policy.observation_spec import (
-    ObservationSpec,
-    SeenCamera,
-    camera_mismatch,
-    further_mismatch,
-)
 from airl_mav.profiles.camera import Camera, check_noise, check_twin_imaging
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
@@ -292,7 +287,7 @@ class Sight(NamedTuple):
     """Main camera."""
     further: dict[str, Camera]
     """Additional cameras of the vehicle that the environment names."""
-    observation: ObservationSpec
+    observation: observation_spec.ObservationSpec
 
     @property
     def intrinsics(self) -> Intrinsics:
@@ -317,7 +312,7 @@ def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
         UsageError: The vehicle's cameras do not match the layout, or a camera is missing.
     """
     camera = spec.camera.of(vehicle.camera)
-    observation = ObservationSpec(
+    observation = observation_spec.ObservationSpec(
         **{name: getattr(spec, name) for name in ("layout", "frames", "in_flight", "goal_height")},
         **{name: getattr(camera, name) for name in LENS},
         height_px=spec.image_height_px,
@@ -325,9 +320,9 @@ def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
         cameras=further_seen(spec, vehicle),
     )
     sight = Sight(camera, {name: vehicle.cameras[name] for name in spec.cameras}, observation)
-    if problem := camera_mismatch(observation, sight.intrinsics):
+    if problem := observation_spec.camera_mismatch(observation, sight.intrinsics):
         raise UsageError(f"image_width_px, image_height_px: {problem}")
-    if problem := further_mismatch(observation, sight.lenses):
+    if problem := observation_spec.further_mismatch(observation, sight.lenses):
         raise UsageError(f"cameras: {problem}")
     # A level scan assumes that the middle of the image is ahead.
     if spec.layout == "scan" and camera.yaw_deg != 0.0:
@@ -336,7 +331,9 @@ def sight_of(spec: EnvironmentSpec, vehicle: VehicleProfile) -> Sight:
     return sight
 
 
-def further_seen(spec: EnvironmentSpec, vehicle: VehicleProfile) -> dict[str, SeenCamera]:
+def further_seen(
+    spec: EnvironmentSpec, vehicle: VehicleProfile
+) -> dict[str, observation_spec.SeenCamera]:
     """Return the observation layout of additional cameras by name.
 
     Raises:
@@ -349,7 +346,7 @@ def further_seen(spec: EnvironmentSpec, vehicle: VehicleProfile) -> dict[str, Se
             has = ", ".join(map(repr, vehicle.cameras)) or "none beside its main one"
             problem = f"vehicle {spec.vehicle} has no such camera; accepted: {has}"
             raise FieldError(f"cameras.{name}", problem=problem)
-        found[name] = SeenCamera(
+        found[name] = observation_spec.SeenCamera(
             **{field: getattr(camera, field) for field in LENS},
             height_px=asked.image_height_px or camera.height_px,
             width_px=asked.image_width_px or camera.width_px,

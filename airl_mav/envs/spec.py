@@ -23,15 +23,9 @@ from airl_mav.policy.actions import (
 )
 from airl_mav.policy.layouts import LEAST_ROWS, STRIP_ROWS
 from airl_mav.policy.observation_spec import CameraName, Frames, GoalHeight, LayoutName, Told
+from airl_mav.profiles import projections
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
-from airl_mav.profiles.projections import (
-    CYLINDER_MOST_DEG,
-    CameraKind,
-    Projection,
-    check_distortion,
-    check_fov,
-)
 from airl_mav.profiles.vehicle import load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "progress", "paced", "paper-scaled", "paper")
@@ -84,7 +78,7 @@ class CameraChange(ProfileModel):
 
     width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
     height_px: int | None = quantity("image height", "px", ge=1, le=480, default=None)
-    projection: Projection | None = Field(
+    projection: projections.Projection | None = Field(
         default=None,
         description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye of up to"
         " 190 deg",
@@ -93,18 +87,20 @@ class CameraChange(ProfileModel):
         "horizontal field of view, less than 170 with a pinhole",
         "deg",
         gt=10,
-        le=CYLINDER_MOST_DEG,
+        le=projections.CYLINDER_MOST_DEG,
         default=None,
     )
     range_m: float | None = quantity("farthest depth returned", "m", gt=0.5, le=65, default=None)
-    kind: CameraKind | None = Field(default=None, description="pixel type: depth, rgb or grey")
+    kind: projections.CameraKind | None = Field(
+        default=None, description="pixel type: depth, rgb or grey"
+    )
 
     def of(self, camera: Camera) -> Camera:
         """Return a vehicle's camera with the changes. Raises FieldError for a mismatch."""
         made = camera.model_copy(update=self.model_dump(exclude_none=True))
         fov_deg = made.horizontal_fov_deg
-        check_fov("camera.horizontal_fov_deg", made.projection, fov_deg)
-        check_distortion("camera.distortion", made.projection, fov_deg, made.distortion)
+        projections.check_fov("camera.horizontal_fov_deg", made.projection, fov_deg)
+        projections.check_distortion("camera.distortion", made.projection, fov_deg, made.distortion)
         check_matched("camera.kind", made)
         check_rows("camera.height_px", made)
         return made

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
+from airl_mav.envs import saved_state
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.navigation_env import (
     FLYING,
@@ -24,16 +25,6 @@ from airl_mav.envs.navigation_env import (
     outcome,
     zone_option,
 )
-from airl_mav.envs.saved_state import (
-    State,
-    Stateful,
-    pack,
-    pack_generators,
-    saved_array,
-    state_of_part,
-    unpack,
-    unpack_generators,
-)
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.layouts import Encoded
@@ -42,7 +33,9 @@ AHEAD = 32
 """Number of arenas generated ahead at a time."""
 
 
-class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
+class NavigationVectorEnv(
+    FleetDecisions, saved_state.Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]
+):
     """N flights; by default they reset in the step in which they end (Gymnasium's SAME_STEP).
 
     `info` has the format of Gymnasium's SyncVectorEnv with n `NavigationEnv`: `seed`, `zone`,
@@ -225,34 +218,38 @@ class NavigationVectorEnv(FleetDecisions, Stateful, VectorEnv[Encoded, NDArray[A
     def _held(self) -> Mapping[str, Any]:
         return {"flights": self.navigation}
 
-    def get_state(self) -> State:
+    def get_state(self) -> saved_state.State:
         """Return the whole state, as copies."""
         curriculum = None if self.curriculum is None else self.curriculum.state()
         own = {
-            "spec": pack(self.environment.model_dump(mode="json")),
+            "spec": saved_state.pack(self.environment.model_dump(mode="json")),
             "started": np.array(self._before is not None),
-            "zone": pack(self._zone),
-            "curriculum": pack(curriculum),
-            "generator": pack_generators([self._np_random]),
+            "zone": saved_state.pack(self._zone),
+            "curriculum": saved_state.pack(curriculum),
+            "generator": saved_state.pack_generators([self._np_random]),
         }
         return super().get_state() | {f"env/{key}": array for key, array in own.items()}
 
-    def set_state(self, state: State) -> None:
+    def set_state(self, state: saved_state.State) -> None:
         """Restore a saved state; the next step continues as without interruption.
 
         Raises:
             UsageError: The state is from another environment.
         """
-        own = state_of_part(state, "env")
+        own = saved_state.state_of_part(state, "env")
         # The state contains its environment, so that another one can reject it.
-        self._check_same(unpack(saved_array(own, "spec")))
+        self._check_same(saved_state.unpack(saved_state.saved_array(own, "spec")))
         super().set_state(state)
-        self._zone = unpack(saved_array(own, "zone"))
-        (self._np_random,) = unpack_generators(saved_array(own, "generator"))
-        curriculum = unpack(saved_array(own, "curriculum"))
+        self._zone = saved_state.unpack(saved_state.saved_array(own, "zone"))
+        (self._np_random,) = saved_state.unpack_generators(
+            saved_state.saved_array(own, "generator")
+        )
+        curriculum = saved_state.unpack(saved_state.saved_array(own, "curriculum"))
         if self.curriculum is not None:
             self.curriculum.restore(curriculum[0], tuple(curriculum[1]))
-        self._before = self.navigation.flights() if saved_array(own, "started") else None
+        self._before = (
+            self.navigation.flights() if saved_state.saved_array(own, "started") else None
+        )
 
     def _check_same(self, theirs: dict[str, Any]) -> None:
         ours = self.environment.model_dump(mode="json")

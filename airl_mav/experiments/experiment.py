@@ -19,17 +19,7 @@ from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import utc_now
 from airl_mav.core.files import Arrays
 from airl_mav.core.progress import Progress, RichProgress, new_console
-from airl_mav.experiments.campaign import (
-    CampaignRun,
-    Cell,
-    CellRun,
-    Declaration,
-    DeclaredCell,
-    open_campaign,
-    run_cell,
-    run_cells,
-    shared_flights,
-)
+from airl_mav.experiments import campaign
 from airl_mav.experiments.executors import Executor, open_executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
 from airl_mav.flight.episode_record import EpisodeRecord, run_sha256
@@ -51,7 +41,7 @@ class Experiment:
     kind: Kind
     name: str
     facts: dict[str, Any]
-    cells: tuple[Cell, ...]
+    cells: tuple[campaign.Cell, ...]
     remarks: tuple[str, ...] = ()
     """Warnings to print before the first flight."""
 
@@ -61,14 +51,14 @@ class Experiment:
         return out or Path("runs") / name
 
     @property
-    def declaration(self) -> Declaration:
+    def declaration(self) -> campaign.Declaration:
         """Content of the folder's declaration file."""
-        shared = shared_flights(self.cells)
-        return Declaration(
+        shared = campaign.shared_flights(self.cells)
+        return campaign.Declaration(
             kind=self.kind,
             settings={},
             cells={
-                cell.name: DeclaredCell(
+                cell.name: campaign.DeclaredCell(
                     title=cell.title,
                     settings=cell.scenario.config,
                     folder=None if shared[cell.name] is cell else shared[cell.name].name,
@@ -87,7 +77,7 @@ class ExperimentRun:
     experiment: Experiment
     path: Path
     """Folder of the experiment, with a run folder for each cell."""
-    cells: tuple[CellRun, ...]
+    cells: tuple[campaign.CellRun, ...]
     """Cells with flights, in the order of the experiment."""
     ended: Ended
     problem: str = ""
@@ -136,13 +126,13 @@ def file_name(text: str) -> str:
 
 def make_cell(
     name: str, title: str, scenario: Scenario, *, label: str = "", role: str = "", group: str = ""
-) -> Cell:
+) -> campaign.Cell:
     """Resolve a scenario as a cell. Raises UsageError if it cannot be flown."""
     # A copy without the loaded network: many large networks would fill the memory.
-    return Cell(name, title, replace(resolve(scenario)), label, role, group)
+    return campaign.Cell(name, title, replace(resolve(scenario)), label, role, group)
 
 
-def entry_of(cell: Cell, folder: str) -> RunEntry:
+def entry_of(cell: campaign.Cell, folder: str) -> RunEntry:
     """Return a cell's entry in the comparison; `folder` is relative to the comparison's folder."""
     card = cell.scenario.policy.card
     trained_in = None if card is None else card.training.arena
@@ -178,13 +168,13 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
     for remark in (*experiment.remarks, *known_seeds(experiment.cells)):
         progress.note(remark, "yellow")
 
-    def tell(run: CellRun) -> None:
+    def tell(run: campaign.CellRun) -> None:
         progress.note(f"{run.cell.title}: {outcome_line(run)}")
 
-    runs: list[CellRun] = []
+    runs: list[campaign.CellRun] = []
     state: Ended = "complete"
     problem = ""
-    with open_campaign(
+    with campaign.open_campaign(
         root,
         experiment.declaration,
         command=" ".join(sys.argv),
@@ -209,43 +199,43 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
 
 def _fly_by_workers(
     root: Path,
-    cells: Sequence[Cell],
+    cells: Sequence[campaign.Cell],
     progress: Progress,
-    tell: Callable[[CellRun], None],
-) -> CampaignRun:
+    tell: Callable[[campaign.CellRun], None],
+) -> campaign.CampaignRun:
     asked = cells[0].scenario.scenario
     in_process = asked.level == "gym"
     with stop_on_signals() as stop, open_executor(asked, in_process=in_process) as executor:
-        return run_cells(root, cells, executor, progress=progress, stop=stop, ended=tell)
+        return campaign.run_cells(root, cells, executor, progress=progress, stop=stop, ended=tell)
 
 
 def _fly_live(
     root: Path,
-    cells: Sequence[Cell],
+    cells: Sequence[campaign.Cell],
     progress: Progress,
-    tell: Callable[[CellRun], None],
-) -> CampaignRun:
-    runs: list[CellRun] = []
-    first_of = shared_flights(cells)
+    tell: Callable[[campaign.CellRun], None],
+) -> campaign.CampaignRun:
+    runs: list[campaign.CellRun] = []
+    first_of = campaign.shared_flights(cells)
     for cell in cells:
         if (first := first_of[cell.name]) is not cell:
             runs.append(replace(next(run for run in runs if run.cell is first), cell=cell))
             continue
         flown = fly_live(cell.scenario, root.absolute() / cell.name, progress, name=cell.name)
-        runs.append(CellRun(cell, flown.path, flown.episodes, flown.new))
+        runs.append(campaign.CellRun(cell, flown.path, flown.episodes, flown.new))
         if flown.ended != "complete":
-            return CampaignRun(tuple(runs), False, flown.ended, flown.problem)
+            return campaign.CampaignRun(tuple(runs), False, flown.ended, flown.problem)
         tell(runs[-1])
-    return CampaignRun(tuple(runs), True, "complete", None)
+    return campaign.CampaignRun(tuple(runs), True, "complete", None)
 
 
-def outcome_line(run: CellRun) -> str:
+def outcome_line(run: campaign.CellRun) -> str:
     """Return the outcomes of a cell's flights as text."""
     told = count_outcomes([episode.outcome for episode in run.episodes])
     return told if run.new else f"{told} (flown before)"
 
 
-def known_seeds(cells: Sequence[Cell]) -> list[str]:
+def known_seeds(cells: Sequence[campaign.Cell]) -> list[str]:
     """Return a warning for each policy whose training may have included the seeds."""
     warnings: dict[str, str] = {}
     for cell in cells:
@@ -353,10 +343,10 @@ def fly_scenario(
     name = run_name(scenario)
     if asked.level == "sitl":
         return fly_live(scenario, out, progress, name=name)
-    cell = Cell(name, f"{scenario.policy.name} in {scenario.arena_name}", scenario)
+    cell = campaign.Cell(name, f"{scenario.policy.name} in {scenario.arena_name}", scenario)
     with stop_on_signals() as stop, nullcontext(executor) if executor else workers_of(asked) as who:
         assert who is not None  # noqa: S101 (the level is not sitl)
-        run = run_cell(out, cell, who, progress=progress, stop=stop)
+        run = campaign.run_cell(out, cell, who, progress=progress, stop=stop)
     (flown,) = run.cells
     tell_end(flown.path, run.ended, run.error or "", progress)
     return FlownRun(flown.path, run.ended, flown.episodes, flown.new, run.error or "")

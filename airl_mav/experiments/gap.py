@@ -16,19 +16,9 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.progress import Progress
 from airl_mav.envs.spec import Delay
+from airl_mav.experiments import experiment
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.executors import Executor
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    entry_of,
-    file_name,
-    fly_scenario,
-    known_seeds,
-    make_cell,
-    run_and_compare,
-    workers_of,
-)
 from airl_mav.experiments.live import Ended, FlownRun
 from airl_mav.flight.requirements import LOOKS, Requirement, RequirementDecision
 from airl_mav.flight.statistics import reached_goals
@@ -106,7 +96,7 @@ def gap(
     arenas: Sequence[str] = (),
     out: Path | str | None = None,
     progress: bool = False,
-) -> ExperimentResult:
+) -> experiment.ExperimentResult:
     """Measure a policy's loss on an onboard computer, with and without mitigation.
 
     All runs use the same seeds. The policy flies on the reference and on the onboard computer,
@@ -132,7 +122,7 @@ def gap(
         reference_workload=reference_workload,
         arenas=arenas,
     )
-    return run_and_compare(declared, out, progress=progress)
+    return experiment.run_and_compare(declared, out, progress=progress)
 
 
 def declare_gap(
@@ -142,7 +132,7 @@ def declare_gap(
     reference: str = REFERENCE_COMPUTER,
     reference_workload: str | None = None,
     arenas: Sequence[str] = (),
-) -> Experiment:
+) -> experiment.Experiment:
     """Declare a hardware gap; see `gap`. Raises UsageError."""
     policy = find_policy(scenario.policy, trust=scenario.trust)
     other = _mitigated(mitigated, trust=scenario.trust)
@@ -191,7 +181,9 @@ def declare_gap(
             asked = scenario.model_copy(update=flown)
             title = f"{label}, {short}"
             cells.append(
-                make_cell(f"{short}-{name}", title, asked, label=label, role=role, group=arena)
+                experiment.make_cell(
+                    f"{short}-{name}", title, asked, label=label, role=role, group=arena
+                )
             )
     facts = {
         "policy": policy.name,
@@ -207,7 +199,9 @@ def declare_gap(
         "seed": scenario.seed,
         "remarks": list(remarks),
     }
-    return Experiment("gap", f"{policy.name}-{target.name}", facts, tuple(cells), remarks)
+    return experiment.Experiment(
+        "gap", f"{policy.name}-{target.name}", facts, tuple(cells), remarks
+    )
 
 
 def _ways_of_compensation(
@@ -337,11 +331,15 @@ def seek_verdict(
     )
     cells = {cell.role: cell for cell in declared.cells}
     target, undelayed = cells["target"], cells["reference"]
-    out = out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-verdict-{file_name(declared.name)}"
+    out = (
+        out
+        or Path("runs")
+        / f"{utc_now():%Y%m%dT%H%M%SZ}-verdict-{experiment.file_name(declared.name)}"
+    )
     check_folder(out, comparison_file(out, declared.kind).name)
-    for warning in known_seeds((target,)):
+    for warning in experiment.known_seeds((target,)):
         progress.note(warning, "yellow")
-    with workers_of(scenario) as executor:
+    with experiment.workers_of(scenario) as executor:
         fly = partial(_fly, out=out, progress=progress, executor=executor)
         for n in _looks(scenario.episodes, _planned(out / target.name)):
             flown = fly(target, n)
@@ -362,7 +360,9 @@ def seek_verdict(
 
     facts = {**declared.facts, "episodes": n, show.FLOWN_UNTIL: "the success rate was decided"}
     # The last interim analysis sets the planned number, which the run folder contains.
-    entries = [replace(entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)]
+    entries = [
+        replace(experiment.entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)
+    ]
     comparison, runs = show.build_comparison(out, declared.kind, facts, entries)
     verdict = show.judge_comparison(comparison, runs, requirements)
     return SoughtVerdict(out, "complete", verdict, comparison, runs)
@@ -373,7 +373,7 @@ def _fly(
 ) -> FlownRun:
     """Fly the missing episodes among the first n of a cell."""
     asked = cell.scenario.scenario.model_copy(update={"episodes": n})
-    return fly_scenario(resolve(asked), out / cell.name, progress, executor=executor)
+    return experiment.fly_scenario(resolve(asked), out / cell.name, progress, executor=executor)
 
 
 def _planned(run: Path) -> int:

@@ -19,30 +19,21 @@ from airl_mav.lockstep.turns import FlightDigest, Partner, Turn
 from airl_mav.lockstep.vehicle import VehicleEnd, acknowledged, command_of
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import FirmwareLostError
-from firmware_sim.mavlink.codec import (
-    Decoder,
-    Encoder,
-    WireLayout,
-    WireMessage,
-    dialect,
-    layout,
-    payload,
-    trimmed,
-)
+from firmware_sim.mavlink import codec
 
 REPEAT_US = US_PER_S // 20
 """Interval at which MAVSDK repeats the newest setpoint [µs] (its offboard plugin: 20 Hz)."""
 
 _SETPOINTS = (
-    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED,
-    dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT,
-    dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET,
+    codec.dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED,
+    codec.dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT,
+    codec.dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET,
 )
 _BY_THE_WALL_CLOCK = (
-    dialect.MAVLINK_MSG_ID_HEARTBEAT,
-    dialect.MAVLINK_MSG_ID_PING,
-    dialect.MAVLINK_MSG_ID_TIMESYNC,
-    dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
+    codec.dialect.MAVLINK_MSG_ID_HEARTBEAT,
+    codec.dialect.MAVLINK_MSG_ID_PING,
+    codec.dialect.MAVLINK_MSG_ID_TIMESYNC,
+    codec.dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
 )
 _MAVLINK_2 = b"\xfd"
 """First byte of a MAVLink 2 frame."""
@@ -53,25 +44,28 @@ _IGNORED = frozenset(number.to_bytes(3, "little") for number in _BY_THE_WALL_CLO
 _TIME_BYTES = 4
 """Length of the time stamp at the start of a setpoint's payload."""
 _ASKED_BY_THE_WALL_CLOCK = {
-    (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION): (
-        dialect.MAV_RESULT_DENIED
+    (codec.dialect.MAV_CMD_REQUEST_MESSAGE, codec.dialect.MAVLINK_MSG_ID_HOME_POSITION): (
+        codec.dialect.MAV_RESULT_DENIED
     ),
-    (dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): (
-        dialect.MAV_RESULT_ACCEPTED
+    (codec.dialect.MAV_CMD_SET_MESSAGE_INTERVAL, codec.dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): (
+        codec.dialect.MAV_RESULT_ACCEPTED
     ),
 }
 """Automatic requests of MAVSDK (command, message), and the answers sent here. MAVSDK requests
 HOME_POSITION every second until it arrives with its stream. It requests EXTENDED_SYS_STATE at 1 Hz
 at an arbitrary time, which is the stream's rate from the start."""
 
-_RATES_AND_REQUESTS = (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
+_RATES_AND_REQUESTS = (
+    codec.dialect.MAV_CMD_REQUEST_MESSAGE,
+    codec.dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+)
 """Commands that MAVSDK sends in any order when it connects: excluded from the digest."""
 
 _ENDS_OFFBOARD = (
-    dialect.MAV_CMD_DO_SET_MODE,
-    dialect.MAV_CMD_NAV_LAND,
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH,
-    dialect.MAV_CMD_NAV_TAKEOFF,
+    codec.dialect.MAV_CMD_DO_SET_MODE,
+    codec.dialect.MAV_CMD_NAV_LAND,
+    codec.dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH,
+    codec.dialect.MAV_CMD_NAV_TAKEOFF,
 )
 
 
@@ -89,7 +83,7 @@ class Passed:
 
 NOTHING = Passed()
 
-Encoders: TypeAlias = "dict[tuple[int, int], Encoder]"
+Encoders: TypeAlias = "dict[tuple[int, int], codec.Encoder]"
 """Encoders by sender: system and component id."""
 
 
@@ -99,11 +93,11 @@ class Inbound:
     def __init__(self) -> None:
         self.next_repeat_us: int | None = None
         """Time of the next setpoint repetition [µs]; None = no repetition."""
-        self._setpoint: tuple[tuple[int, int], WireLayout, bytes] | None = None
+        self._setpoint: tuple[tuple[int, int], codec.WireLayout, bytes] | None = None
         """Newest setpoint: sender, layout, and payload after the time stamp."""
         self._counted = 0
         """Number of the companion's setpoints delivered so far."""
-        self._decoder = Decoder(datagrams=True)
+        self._decoder = codec.Decoder(datagrams=True)
         self._numbered: Encoders = {}
         self._aside: Encoders = {}
         """Encoders with separate sequence numbers, for messages in any order."""
@@ -121,11 +115,11 @@ class Inbound:
         message = messages[0]
         number = message.get_msgId()
         # Messages that MAVSDK sends at wall times would make the flight irreproducible.
-        if number in _BY_THE_WALL_CLOCK or number == dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
+        if number in _BY_THE_WALL_CLOCK or number == codec.dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
             return NOTHING
         if number in _SETPOINTS:
             return self._take_setpoint(message, now_us)
-        if number == dialect.MAVLINK_MSG_ID_COMMAND_LONG:
+        if number == codec.dialect.MAVLINK_MSG_ID_COMMAND_LONG:
             return self._take_command(message, now_us)
         # Repacked with a new sequence number: dropped frames must leave no gap.
         return Passed((self._pack(message),))
@@ -149,17 +143,17 @@ class Inbound:
         """Stop all repetitions: the companion and MAVSDK have ended."""
         self.next_repeat_us = None
 
-    def _take_setpoint(self, message: WireMessage, now_us: int) -> Passed:
+    def _take_setpoint(self, message: codec.WireMessage, now_us: int) -> Passed:
         sender = message.get_srcSystem(), message.get_srcComponent()
-        values = payload(message)[_TIME_BYTES:].rstrip(b"\0")
-        setpoint = sender, layout(message.get_type()), values
+        values = codec.payload(message)[_TIME_BYTES:].rstrip(b"\0")
+        setpoint = sender, codec.layout(message.get_type()), values
         if setpoint == self._setpoint:
             return NOTHING
         self._setpoint = setpoint
         self._counted += 1
         return Passed((self.repeat(now_us),))
 
-    def _take_command(self, message: WireMessage, now_us: int) -> Passed:
+    def _take_command(self, message: codec.WireMessage, now_us: int) -> Passed:
         # Commands that MAVSDK sends at wall times are answered here, not by the vehicle.
         result = _ASKED_BY_THE_WALL_CLOCK.get((message.command, message.param1))
         if result is not None:
@@ -184,30 +178,30 @@ class Inbound:
         self.next_repeat_us = now_us + REPEAT_US
         sender, kind, values = self._setpoint
         stamp = (now_us // US_PER_MS).to_bytes(_TIME_BYTES, "little")
-        return _encoder(self._numbered, sender).frame(kind, trimmed(stamp + values))
+        return _encoder(self._numbered, sender).frame(kind, codec.trimmed(stamp + values))
 
-    def _pack(self, message: WireMessage, encoders: Encoders | None = None) -> bytes:
+    def _pack(self, message: codec.WireMessage, encoders: Encoders | None = None) -> bytes:
         encoders = self._numbered if encoders is None else encoders
         sender = message.get_srcSystem(), message.get_srcComponent()
         return _encoder(encoders, sender).pack(message)
 
-    def _answer(self, command: WireMessage, result: int) -> bytes:
+    def _answer(self, command: codec.WireMessage, result: int) -> bytes:
         sender = command.get_srcSystem(), command.get_srcComponent()
-        vehicle = command.target_system, dialect.MAV_COMP_ID_AUTOPILOT1
+        vehicle = command.target_system, codec.dialect.MAV_COMP_ID_AUTOPILOT1
         return _encoder(self._own, vehicle).pack(
-            dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *sender)
+            codec.dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *sender)
         )
 
 
-def _encoder(encoders: Encoders, sender: tuple[int, int]) -> Encoder:
+def _encoder(encoders: Encoders, sender: tuple[int, int]) -> codec.Encoder:
     """Return a sender's encoder, created on first use."""
     if sender not in encoders:
-        encoders[sender] = Encoder(*sender)
+        encoders[sender] = codec.Encoder(*sender)
     return encoders[sender]
 
 
-def _enters_offboard(command: WireMessage) -> bool:
-    mode = command.command == dialect.MAV_CMD_DO_SET_MODE
+def _enters_offboard(command: codec.WireMessage) -> bool:
+    mode = command.command == codec.dialect.MAV_CMD_DO_SET_MODE
     return bool(mode and command.param2 == Mode.OFFBOARD.spec.main)
 
 

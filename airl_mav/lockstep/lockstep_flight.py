@@ -21,15 +21,8 @@ from airl_mav.lockstep.stage import PATIENCE_S, LockstepStage
 from airl_mav.lockstep.turns import FlightDigest, LockstepError, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.vehicle import real_vehicle
 from airl_mav.policy.actions import Policy
+from airl_mav.rehearsal import episode
 from airl_mav.rehearsal.channel import Text
-from airl_mav.rehearsal.episode import (
-    EpisodeSupervisor,
-    Order,
-    faults_of,
-    join_stamps,
-    judged_record,
-    part_of,
-)
 from airl_mav.rehearsal.firmware_process import episode_setup, state_of
 from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.observer import Observer
@@ -184,7 +177,7 @@ class LockstepFlight:
         self._witnessed = resolved.scenario.firmware == "builtin"
         self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()
-        self._supervisor = EpisodeSupervisor(Referee(resolved.task(self._goal)), 0)
+        self._supervisor = episode.EpisodeSupervisor(Referee(resolved.task(self._goal)), 0)
         self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
@@ -286,11 +279,11 @@ class LockstepFlight:
         if self._observer.shows_states and self._ticks // SHOW_EVERY > shown:
             self._observer.state(state_of(simulation, self._judge.hit), simulation.start_us)
 
-    def _order(self, order: Order) -> None:
+    def _order(self, order: episode.Order) -> None:
         verdict = self._supervisor.verdict
         if not self._lands and verdict is not None and verdict.outcome is Outcome.TIMEOUT:
             return
-        if order is Order.ABANDON:
+        if order is episode.Order.ABANDON:
             self._stage.abandon.set()
         self._stop.set()
 
@@ -316,14 +309,14 @@ class LockstepFlight:
             battery = simulation.plant.battery_remaining
             referee.abort(simulation.time_us, self._stage.out or result.reason)
         arrays = simulation.arrays()
-        trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
-        setpoints = part_of(arrays, "setpoints")
+        trajectory = Trajectory.from_arrays(episode.part_of(arrays, "trajectory"))
+        setpoints = episode.part_of(arrays, "setpoints")
         # The digest covers the setpoints that the vehicle has accepted.
         self._digest.add_setpoints(setpoints)
-        latency = part_of(arrays, "estimate", keep_prefix=True)
+        latency = episode.part_of(arrays, "estimate", keep_prefix=True)
         # No slips in lockstep, hence the empty array.
-        latency |= join_stamps(result.log.columns(), setpoints, np.zeros((0, 2), np.int64))
-        record = judged_record(
+        latency |= episode.join_stamps(result.log.columns(), setpoints, np.zeros((0, 2), np.int64))
+        record = episode.judged_record(
             self._resolved,
             referee,
             trajectory,
@@ -337,7 +330,7 @@ class LockstepFlight:
             slipped_us=0,
             battery_remaining=battery,
             notes=(*self._notes, *result.notes, *self._stage.firmware.logs_lost),
-            faults=faults_of(arrays),
+            faults=episode.faults_of(arrays),
             sha256=self._fingerprint(),
         )
         # A flight that a viewer changed is not reproducible: its digest is removed.
@@ -358,10 +351,10 @@ class Judge:
 
     def __init__(
         self,
-        supervisor: EpisodeSupervisor | None,
+        supervisor: episode.EpisodeSupervisor | None,
         digest: FlightDigest,
         *,
-        order: Callable[[Order], None],
+        order: Callable[[episode.Order], None],
         judged: Callable[[Verdict], None] = lambda _: None,
     ) -> None:
         """Set the supervisor, None = no verdict, and the digest of the true trajectory.
@@ -405,7 +398,7 @@ class Judge:
             for time_us, motion, _, charge in truths[first:].tolist():
                 self._see(supervisor, TruthSample(time_us, motion[:3], self._crash.hit, charge))
 
-    def _see(self, supervisor: EpisodeSupervisor, sample: TruthSample) -> None:
+    def _see(self, supervisor: episode.EpisodeSupervisor, sample: TruthSample) -> None:
         before = supervisor.verdict
         order = supervisor.see(sample)
         if before is None and supervisor.verdict is not None:

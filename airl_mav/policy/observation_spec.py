@@ -13,18 +13,8 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.policy.layouts import INPUTS, LEAST_ROWS, SHIPPED, layout_of
+from airl_mav.profiles import projections
 from airl_mav.profiles.camera import Coefficients, camera_named
-from airl_mav.profiles.projections import (
-    CHANNELS,
-    CYLINDER_MOST_DEG,
-    UNDISTORTED,
-    CameraKind,
-    Projection,
-    check_distortion,
-    check_fov,
-    distorted,
-    undistorted,
-)
 
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
 
@@ -61,7 +51,7 @@ GoalHeight = Annotated[
 Width = Annotated[int, quantity("width of the image that the network sees", "px", ge=4, le=640)]
 
 SeenProjection = Annotated[
-    Projection,
+    projections.Projection,
     Field(
         description="how directions fall on the image: pinhole, cylindrical for a field of view of"
         " up to 360 deg, or fisheye (equidistant but for its distortion) of up to 190 deg"
@@ -74,7 +64,7 @@ FieldOfView = Annotated[
         "horizontal field of view, less than 170 with a pinhole",
         "deg",
         gt=10,
-        le=CYLINDER_MOST_DEG,
+        le=projections.CYLINDER_MOST_DEG,
     ),
 ]
 
@@ -103,17 +93,19 @@ class SeenCamera(ProfileModel):
     width_px: Width
     projection: SeenProjection = "pinhole"
     horizontal_fov_deg: FieldOfView
-    distortion: SeenDistortion = later_field(UNDISTORTED)
+    distortion: SeenDistortion = later_field(projections.UNDISTORTED)
     range_m: Range
-    kind: CameraKind = Field(
+    kind: projections.CameraKind = Field(
         default="depth", description="pixel type of the camera, the prefix of the image's key"
     )
     frames: Frames = 1
 
     @model_validator(mode="after")
     def _sees(self) -> SeenCamera:
-        check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        check_distortion("distortion", self.projection, self.horizontal_fov_deg, self.distortion)
+        projections.check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        projections.check_distortion(
+            "distortion", self.projection, self.horizontal_fov_deg, self.distortion
+        )
         return self
 
     @property
@@ -124,7 +116,7 @@ class SeenCamera(ProfileModel):
     @property
     def channels(self) -> int:
         """Channels of the network's image, over all frames."""
-        return CHANNELS[self.kind] * self.frames
+        return projections.CHANNELS[self.kind] * self.frames
 
 
 class ObservationSpec(ProfileModel):
@@ -140,9 +132,9 @@ class ObservationSpec(ProfileModel):
     width_px: Width
     projection: SeenProjection = "pinhole"
     horizontal_fov_deg: FieldOfView
-    distortion: SeenDistortion = later_field(UNDISTORTED)
+    distortion: SeenDistortion = later_field(projections.UNDISTORTED)
     range_m: Range
-    kind: CameraKind = Field(
+    kind: projections.CameraKind = Field(
         default="depth",
         description="pixel type of the camera and key of the image: depth, rgb or grey",
     )
@@ -163,8 +155,10 @@ class ObservationSpec(ProfileModel):
     def _fits_the_layout(self) -> ObservationSpec:
         if (problem := layout_of(self.layout).problem(self)) is not None:
             raise ValueError(problem)
-        check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        check_distortion("distortion", self.projection, self.horizontal_fov_deg, self.distortion)
+        projections.check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        projections.check_distortion(
+            "distortion", self.projection, self.horizontal_fov_deg, self.distortion
+        )
         return self
 
     @property
@@ -249,9 +243,11 @@ def _apart_deg(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> float:
     if spec.distortion == camera.distortion:
         return 0.0
     half = 0.5 * math.radians(spec.horizontal_fov_deg)
-    rim = float(distorted(half, spec.distortion))
+    rim = float(projections.distorted(half, spec.distortion))
     places = np.linspace(0.0, 1.0, 65)
-    theirs = undistorted(places * (0.5 * camera.width / camera.focal), camera.distortion)
-    apart = np.abs(undistorted(places * rim, spec.distortion) - theirs)
+    theirs = projections.undistorted(
+        places * (0.5 * camera.width / camera.focal), camera.distortion
+    )
+    apart = np.abs(projections.undistorted(places * rim, spec.distortion) - theirs)
     # Rounding may put the edge beyond the rim of either lens.
     return math.degrees(float(np.max(apart[np.isfinite(apart)])))

@@ -16,18 +16,7 @@ from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, section
-from airl_mav.profiles.projections import (
-    CYLINDER_MOST_DEG,
-    MOST_COEFFICIENT,
-    PROJECTIONS,
-    UNDISTORTED,
-    CameraKind,
-    Distortion,
-    Projection,
-    Renderer,
-    check_distortion,
-    check_fov,
-)
+from airl_mav.profiles import projections
 
 if TYPE_CHECKING:
     from airl_mav.faults import Fault
@@ -38,7 +27,9 @@ if TYPE_CHECKING:
 else:
     Imaging = section("camera.imaging")
 
-Coefficients = Annotated[Distortion, Each(-MOST_COEFFICIENT, MOST_COEFFICIENT)]
+Coefficients = Annotated[
+    projections.Distortion, Each(-projections.MOST_COEFFICIENT, projections.MOST_COEFFICIENT)
+]
 """Distortion coefficients of a fisheye."""
 
 
@@ -76,12 +67,12 @@ class Ranging(ProfileModel):
 class Camera(ProfileModel):
     """A camera: the main one looks ahead or all round, additional ones in any direction."""
 
-    kind: CameraKind = later_field(
+    kind: projections.CameraKind = later_field(
         "depth",
         "what its pixels are: depth; rgb, sRGB colours of 8 bits a channel; or grey,"
         " their luma (ITU-R BT.601)",
     )
-    projection: Projection = later_field(
+    projection: projections.Projection = later_field(
         "pinhole",
         "pinhole, cylindrical for a field of view of up to 360 deg, or fisheye"
         " (equidistant but for its distortion) of up to 190 deg",
@@ -97,14 +88,14 @@ class Camera(ProfileModel):
         "horizontal field of view, less than 170 with a pinhole",
         "deg",
         gt=10,
-        le=CYLINDER_MOST_DEG,
+        le=projections.CYLINDER_MOST_DEG,
     )
     distortion: Coefficients = quantity(
         "coefficients k1, k2, k3, k4 of a fisheye, as OpenCV's fisheye calibration and ROS's"
         " equidistant model have them: theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +"
         " k4 theta^8), which must increase over the field of view",
         "1",
-        default=UNDISTORTED,
+        default=projections.UNDISTORTED,
         later=True,
     )
     range_m: float = quantity(
@@ -139,12 +130,12 @@ class Camera(ProfileModel):
 
     @model_validator(mode="after")
     def _projects(self) -> Camera:
-        check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        check_distortion(
+        projections.check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        projections.check_distortion(
             "camera.distortion", self.projection, self.horizontal_fov_deg, self.distortion
         )
         check_rows("camera.height_px", self)
-        if self.stereo is not None and not PROJECTIONS[self.projection].planar:
+        if self.stereo is not None and not projections.PROJECTIONS[self.projection].planar:
             raise FieldError(
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
@@ -180,7 +171,7 @@ def check_matched(field: str, camera: Camera) -> None:
 
 def check_rows(field: str, camera: Camera) -> None:
     """Raise FieldError, naming the field, for an image with too few rows for its projection."""
-    least = PROJECTIONS[camera.projection].least_rows
+    least = projections.PROJECTIONS[camera.projection].least_rows
     if camera.height_px < least:
         accepted = f"value >= {least} px with projection {camera.projection!r}"
         raise FieldError(field, camera.height_px, accepted)
@@ -289,7 +280,7 @@ def check_noise(
 
 
 def check_renderer(
-    camera: Camera, renderer: Renderer, arena: ArenaSpec, further: Iterable[Camera] = ()
+    camera: Camera, renderer: projections.Renderer, arena: ArenaSpec, further: Iterable[Camera] = ()
 ) -> None:
     """Raise FieldError for cameras or arenas that a renderer does not support."""
     if renderer == "raycast":

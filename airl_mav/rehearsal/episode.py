@@ -15,16 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.faults import LINKS, PROCESSES, Fault
+from airl_mav.flight import judge
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
-from airl_mav.flight.judge import (
-    BY_HAND,
-    Outcome,
-    Referee,
-    TruthSample,
-    Verdict,
-    host_faults,
-    host_figures,
-)
 from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
@@ -55,7 +47,7 @@ class Order(Enum):
 class EpisodeSupervisor:
     """Supervisor of one episode. Pure: no clock, no I/O."""
 
-    def __init__(self, referee: Referee, started_us: int) -> None:
+    def __init__(self, referee: judge.Referee, started_us: int) -> None:
         """Take the referee and the start of the episode [µs]."""
         self.referee = referee
         self.started_us = started_us
@@ -63,7 +55,7 @@ class EpisodeSupervisor:
         self._called_off = False
 
     @property
-    def verdict(self) -> Verdict | None:
+    def verdict(self) -> judge.Verdict | None:
         """Return the verdict, or None before it."""
         return self.referee.verdict
 
@@ -79,7 +71,7 @@ class EpisodeSupervisor:
             return self.started_us + TAKEOFF_LIMIT_S * US_PER_S + 1.0
         return referee.navigation_us + referee.task.time_limit_s * US_PER_S
 
-    def see(self, sample: TruthSample) -> Order | None:
+    def see(self, sample: judge.TruthSample) -> Order | None:
         """Process the next true sample; return an order for the companion, or None."""
         referee = self.referee
         if referee.verdict is not None:
@@ -91,9 +83,9 @@ class EpisodeSupervisor:
         elapsed_s = (sample.time_us - self.started_us) / US_PER_S
         if verdict is None and referee.navigation_us is None and elapsed_s > TAKEOFF_LIMIT_S:
             verdict = referee.abort(sample.time_us, "navigation never began")
-        if verdict is None or verdict.outcome is Outcome.SUCCESS:
+        if verdict is None or verdict.outcome is judge.Outcome.SUCCESS:
             return None
-        crashed = verdict.outcome in (Outcome.COLLISION, Outcome.BATTERY)
+        crashed = verdict.outcome in (judge.Outcome.COLLISION, judge.Outcome.BATTERY)
         return self._call_off(land=not crashed)
 
     def _call_off(self, *, land: bool) -> Order | None:
@@ -133,7 +125,7 @@ class RunningEpisode:
     """Start of navigation by the companion's clock, which does not skip time [µs]."""
 
     @property
-    def referee(self) -> Referee:
+    def referee(self) -> judge.Referee:
         """Return the episode's referee."""
         return self.supervisor.referee
 
@@ -141,7 +133,7 @@ class RunningEpisode:
     def separated(self) -> str | None:
         """Return the end reason if the processes lost contact before the verdict, else None."""
         verdict, ended = self.referee.verdict, self.ended
-        if verdict is None or verdict.outcome is not Outcome.ABORTED or ended is None:
+        if verdict is None or verdict.outcome is not judge.Outcome.ABORTED or ended is None:
             return None
         return ended.reason if ended.reason in SEPARATED else None
 
@@ -168,7 +160,7 @@ def join_episode(
     wall_s = record.wall_s
     if wall_s is not None and scenario.speed:
         wall_s -= episode.paused_us / US_PER_S / scenario.speed
-    figures = host_figures(
+    figures = judge.host_figures(
         flight_us=record.ended_us - record.started_us,
         slipped_us=max(0, record.slipped_us - episode.paused_us),
         wall_s=wall_s,
@@ -182,9 +174,9 @@ def join_episode(
         record = replace(record, notes=(*record.notes, *_told_of_images(latency)))
     if scenario.scenario.validity:
         strangers = arrays["commands/strangers"].tolist()
-        record = replace(record, invalid=host_faults(figures, strangers))
+        record = replace(record, invalid=judge.host_faults(figures, strangers))
     if episode.ended is not None and episode.ended.by_hand:
-        notes, invalid = (*record.notes, BY_HAND), (*record.invalid, BY_HAND)
+        notes, invalid = (*record.notes, judge.BY_HAND), (*record.invalid, judge.BY_HAND)
         record = replace(record, notes=notes, invalid=invalid)
     return FlownEpisode(record, trajectory, latency)
 
@@ -245,7 +237,7 @@ def _record(
 
 def judged_record(
     scenario: ResolvedScenario,
-    referee: Referee,
+    referee: judge.Referee,
     trajectory: Trajectory,
     latency: Mapping[str, NDArray[Any]],
     navigation_us: int | None,

@@ -14,7 +14,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import BY_HAND, Referee, TruthSample, Verdict
-from airl_mav.rehearsal import channel
+from airl_mav.rehearsal import channel, process_pair
 from airl_mav.rehearsal.episode import (
     TAKEOFF_LIMIT_S,
     EpisodeSupervisor,
@@ -26,15 +26,6 @@ from airl_mav.rehearsal.episode import (
 )
 from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.rehearsal.observer import WARNING, Observer
-from airl_mav.rehearsal.process_pair import (
-    COMPANION,
-    FIRMWARE,
-    KILLED,
-    REPLY_TIMEOUT_S,
-    LostError,
-    ProcessFaults,
-    ProcessPair,
-)
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.external.programs import load_timeout_s
@@ -67,7 +58,7 @@ class Rehearsal:
         self._folder = folder
         self._observer = observer
         self._keeps = keeps
-        self._pair: ProcessPair | None = None
+        self._pair: process_pair.ProcessPair | None = None
 
     def __enter__(self) -> Rehearsal:
         """Return the rehearsal."""
@@ -90,7 +81,7 @@ class Rehearsal:
         while True:
             try:
                 flown = self._fly(index, seed, notes)
-            except LostError as error:
+            except process_pair.LostError as error:
                 # The next attempt starts two new processes.
                 self._dismiss()
                 notes.append(f"flown again: {error.what}")
@@ -111,11 +102,11 @@ class Rehearsal:
         self._clear(index)
         self._observer.finished(flown.record)
 
-    def _present(self) -> ProcessPair:
+    def _present(self) -> process_pair.ProcessPair:
         """Return the two processes, and start them if needed."""
         if self._pair is None:
             # Stored before the start, so that an interrupt still ends it.
-            self._pair = pair = ProcessPair()
+            self._pair = pair = process_pair.ProcessPair()
             self._observer.waiting("starting firmware and companion")
             log = (self._folder.path / FIRMWARE_PRINTS).absolute()
             begin = channel.Begin(scenario=self._scenario, log=str(log), view=self._view)
@@ -147,7 +138,7 @@ class Rehearsal:
         record_path, decisions_path = self._left_by(index)
         self._clear(index)
         pair.send(
-            FIRMWARE,
+            process_pair.FIRMWARE,
             channel.LoadEpisode(
                 episode=index,
                 seed=seed,
@@ -162,11 +153,11 @@ class Rehearsal:
             load_timeout_s(scenario.scenario),
         )
         supervisor = EpisodeSupervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
-        faults = ProcessFaults(pair, self._speed)
+        faults = process_pair.ProcessFaults(pair, self._speed)
         episode = RunningEpisode(index, seed, loaded, supervisor, WallClock(), faults, known)
         self._observer.episode(index, seed, loaded.goal)
         pair.send(
-            COMPANION,
+            process_pair.COMPANION,
             channel.Fly(
                 episode=index,
                 goal=loaded.goal,
@@ -182,48 +173,54 @@ class Rehearsal:
                 "the flight",
             )
             self._call_back(pair, episode)
-        except LostError as error:
-            if not pair.lives(FIRMWARE):
+        except process_pair.LostError as error:
+            if not pair.lives(process_pair.FIRMWARE):
                 raise
             # The firmware still flies. End the companion and its setpoints, and watch the failsafe.
             faults.undo()
-            pair.stop_one(COMPANION)
+            pair.stop_one(process_pair.COMPANION)
             seen = self._watch_failsafe(pair, episode)
-            raise LostError("; ".join((error.what, *seen)), error.detail) from None
+            raise process_pair.LostError("; ".join((error.what, *seen)), error.detail) from None
         if (reason := episode.separated) is not None and not disturbing(scenario.scenario.faults):
-            raise LostError(f"{SEPARATED_BY} ({reason})")
+            raise process_pair.LostError(f"{SEPARATED_BY} ({reason})")
         self._observer.waiting("saving the flight")
-        if pair.lives(FIRMWARE):
-            pair.send(FIRMWARE, channel.FinishEpisode())
+        if pair.lives(process_pair.FIRMWARE):
+            pair.send(process_pair.FIRMWARE, channel.FinishEpisode())
             pair.wait_for(channel.Saved, lambda event: self._look(event, episode.notes))
         flown = join_episode(episode, scenario, record_path, decisions_path)
-        if not (pair.lives(FIRMWARE) and pair.lives(COMPANION)):
+        if not (pair.lives(process_pair.FIRMWARE) and pair.lives(process_pair.COMPANION)):
             self._dismiss()
         if reason is not None and not disturbances(flown.record.faults):
-            raise LostError(f"{SEPARATED_BY} ({reason})")
+            raise process_pair.LostError(f"{SEPARATED_BY} ({reason})")
         return flown
 
     def _longest_s(self) -> float:
         """Return the maximum duration of a flight [wall s]."""
         asked = self._scenario.scenario
-        stands_s = sum(fault.for_s or 0.0 for fault in asked.faults if fault.part == FIRMWARE)
+        stands_s = sum(
+            fault.for_s or 0.0 for fault in asked.faults if fault.part == process_pair.FIRMWARE
+        )
         flown_s = TAKEOFF_LIMIT_S + asked.time_limit_s + WRAP_UP_S
         return (flown_s + stands_s) / self._speed
 
-    def _call_back(self, pair: ProcessPair, episode: RunningEpisode) -> None:
+    def _call_back(self, pair: process_pair.ProcessPair, episode: RunningEpisode) -> None:
         """Resume suspended processes; an aborted companion reports its log."""
         episode.faults.undo()
-        if episode.ended is None and pair.lives(COMPANION):
-            pair.send(COMPANION, channel.Abort(land=False))
+        if episode.ended is None and pair.lives(process_pair.COMPANION):
+            pair.send(process_pair.COMPANION, channel.Abort(land=False))
             try:
                 pair.pump(
-                    lambda _, event: self._follow(pair, episode, event), REPLY_TIMEOUT_S, "its end"
+                    lambda _, event: self._follow(pair, episode, event),
+                    process_pair.REPLY_TIMEOUT_S,
+                    "its end",
                 )
-            except LostError:
+            except process_pair.LostError:
                 # The companion was to be aborted anyway: its decision log is lost.
-                pair.stop_one(COMPANION)
+                pair.stop_one(process_pair.COMPANION)
 
-    def _follow(self, pair: ProcessPair, episode: RunningEpisode, event: channel.Event) -> bool:
+    def _follow(
+        self, pair: process_pair.ProcessPair, episode: RunningEpisode, event: channel.Event
+    ) -> bool:
         """Handle one event of a flight; return True when the companion has ended it."""
         referee = episode.referee
         if isinstance(event, channel.State):
@@ -239,7 +236,7 @@ class Rehearsal:
                 referee.start_navigation(event.time_us - episode.slipped_us)
         elif isinstance(event, channel.Text):
             self._observer.text(event)
-            if episode.faults.out(COMPANION) and event.severity <= WARNING:
+            if episode.faults.out(process_pair.COMPANION) and event.severity <= WARNING:
                 episode.notes.append(_said(event))
         elif isinstance(event, channel.Ended):
             episode.ended = event
@@ -259,19 +256,21 @@ class Rehearsal:
         faults = episode.faults
         if (done := faults.carry_out(due)) is not None:
             episode.notes.append(done)
-        if faults.out(FIRMWARE) == KILLED and faults.reason is not None:
+        if faults.out(process_pair.FIRMWARE) == process_pair.KILLED and faults.reason is not None:
             self._end(episode, faults.reason)
 
     def _over_alone(self, episode: RunningEpisode) -> bool:
         """Return True if a flight without a companion is over: judged, or landed."""
         faults, state = episode.faults, episode.state
-        if not faults.out(COMPANION) or faults.reason is None:
+        if not faults.out(process_pair.COMPANION) or faults.reason is None:
             return False
         if state is not None and not state.armed:
             self._end(episode, faults.reason)
         return episode.referee.verdict is not None
 
-    def _see(self, pair: ProcessPair, episode: RunningEpisode, state: channel.State) -> None:
+    def _see(
+        self, pair: process_pair.ProcessPair, episode: RunningEpisode, state: channel.State
+    ) -> None:
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         judged = episode.referee.verdict is not None
@@ -282,7 +281,7 @@ class Rehearsal:
         if verdict is not None and not judged:
             self._judge(episode, verdict)
         if order is not None:
-            pair.send(COMPANION, channel.Abort(land=order is Order.LAND))
+            pair.send(process_pair.COMPANION, channel.Abort(land=order is Order.LAND))
 
     def _judge(self, episode: RunningEpisode, verdict: Verdict) -> None:
         if episode.wall_us is None:
@@ -291,7 +290,7 @@ class Rehearsal:
             episode.verdict_state = episode.state
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
-    def _watch_failsafe(self, pair: ProcessPair, episode: RunningEpisode) -> list[str]:
+    def _watch_failsafe(self, pair: process_pair.ProcessPair, episode: RunningEpisode) -> list[str]:
         """Watch the flight controller without its companion until disarmed; return its texts."""
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
         said: list[str] = []
@@ -307,7 +306,7 @@ class Rehearsal:
 
         try:
             pair.pump(down, WRAP_UP_S / self._speed, "the vehicle to come down")
-        except LostError as error:
+        except process_pair.LostError as error:
             said.append(error.what)
         return said
 

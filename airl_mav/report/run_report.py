@@ -26,40 +26,16 @@ from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report import document
+from airl_mav.report import document, plotly_scene, run_tables, tracking
 from airl_mav.report.document import Section, ms, tables_section
 from airl_mav.report.energy_section import energy_section
 from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
-from airl_mav.report.plotly_scene import (
-    ALL_FLIGHTS,
-    SceneFlight,
-    plotly_script,
-    scene_json,
-    top_speed,
-)
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_arenas import arenas_of, flown_path, vehicle_of
 from airl_mav.report.run_figures import map_figure, overview_picture
-from airl_mav.report.run_tables import (
-    MAX_FLIGHTS,
-    episodes_table,
-    estimation_table,
-    faults_table,
-    quality_table,
-    real_time_table,
-    setup_rows,
-)
 from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
 from airl_mav.report.theme import FigureImage, palette, shades
 from airl_mav.report.timeline import latency_section
-from airl_mav.report.tracking import (
-    IMAGES,
-    EstimateErrors,
-    TrackedFlight,
-    TrackedMotion,
-    track,
-    tracking_figure,
-)
 
 
 class Steps(TypedDict):
@@ -111,7 +87,7 @@ def chosen(count: int, most: int = MAX_IMAGES, last: int = LAST) -> list[int]:
 
 
 def flight_data(
-    flight: TrackedFlight,
+    flight: tracking.TrackedFlight,
     stamps: Arrays,
     seen: Sequence[SeenDecision],
     range_m: float,
@@ -140,7 +116,9 @@ def flight_data(
     }
 
 
-def _lines(of: TrackedMotion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
+def _lines(
+    of: tracking.TrackedMotion | tracking.EstimateErrors, keep: NDArray[np.int64]
+) -> dict[str, Steps]:
     known = {name: values for name, values in vars(of).items() if values is not None}
     return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
 
@@ -195,8 +173,8 @@ MAX_SHOWN = 24
 class ShownFlight:
     """Flight in the view of single flights."""
 
-    scene: SceneFlight
-    tracked: TrackedFlight
+    scene: plotly_scene.SceneFlight
+    tracked: tracking.TrackedFlight
     seen: tuple[SeenDecision, ...]
     """Recomputed decisions; empty if the arena or the vehicle is unknown."""
 
@@ -265,13 +243,17 @@ def report_input(
     again = None if vehicle is None else policy_again(run.info)
     flights = []
     for record in shown(run):
-        path, tracked, arena = flown_path(run, record), track(run, record), arenas.get(record.index)
+        path, tracked, arena = (
+            flown_path(run, record),
+            tracking.track(run, record),
+            arenas.get(record.index),
+        )
         if path is None or tracked is None:
             continue
         seen: tuple[SeenDecision, ...] = ()
         if arena is not None and vehicle is not None:
             seen = tuple(seen_decisions(run, record, arena, vehicle, again))
-        flights.append(ShownFlight(SceneFlight(record, path, arena), tracked, seen))
+        flights.append(ShownFlight(plotly_scene.SceneFlight(record, path, arena), tracked, seen))
     examine = addons.entries("airl_mav", "FORENSICS").get("examine")
     worst = addons.load(examine)(run, arenas, vehicle) if examine else []
     return ReportInput(run, arenas, vehicle, summarize_run(run), worst, flights, again)
@@ -284,14 +266,14 @@ def by_flight_section(page: ReportInput) -> tuple[Section, ...]:
     if asked:
         chosen_again = f"{sum(asked):,} of {len(asked):,} decisions"
         note += f" The policy, asked again, chose the flown action in {chosen_again}."
-    data = {"together": min(len(page.run.episodes), ALL_FLIGHTS), "best": BEST}
+    data = {"together": min(len(page.run.episodes), plotly_scene.ALL_FLIGHTS), "best": BEST}
     section = Section("Flight by flight", note=note, template="by_flight.html.j2", data=data)
     return (section,) if page.view else ()
 
 
 def flights_section(page: ReportInput) -> tuple[Section, ...]:
     """Return the table of flights, and still pictures of the worst."""
-    top = top_speed([flight.scene for flight in page.view])
+    top = plotly_scene.top_speed([flight.scene for flight in page.view])
     range_m = 0.0 if page.vehicle is None else page.vehicle.camera.range_m
     causes = {each.record.index: each.cause for each in page.worst}
     drawn: list[tuple[EpisodeRecord, Cause | None, list[FigureImage]]] = []
@@ -301,11 +283,11 @@ def flights_section(page: ReportInput) -> tuple[Section, ...]:
         path = None if flight is None else flight.scene.path
         pictures = [map_figure(record, path, page.arenas.get(record.index), top)]
         if flight is not None:
-            seen = [flight.seen[k] for k in chosen(len(flight.seen), IMAGES, 2)]
-            pictures.append(tracking_figure(flight.tracked, seen, range_m))
+            seen = [flight.seen[k] for k in chosen(len(flight.seen), tracking.IMAGES, 2)]
+            pictures.append(tracking.tracking_figure(flight.tracked, seen, range_m))
         drawn.append((record, causes.get(record.index), pictures))
     return tables_section(
-        episodes_table(page.run, MAX_FLIGHTS),
+        run_tables.episodes_table(page.run, run_tables.MAX_FLIGHTS),
         draw=lambda: [picture for *_, pictures in drawn for picture in pictures],
         template="flights.html.j2",
         data=drawn,
@@ -318,7 +300,7 @@ def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
     fov, range_m = (0.0, 0.0) if vehicle is None else (
         vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
     )  # fmt: skip
-    everyone = ranked(run.episodes)[:ALL_FLIGHTS]
+    everyone = ranked(run.episodes)[: plotly_scene.ALL_FLIGHTS]
     data: dict[str, Any] = {
         "pictures": {picture.name: picture.svg for picture in pictures},
         "flights": [
@@ -336,7 +318,7 @@ def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
         ],
         "palette": palette(),
     }
-    views = scene_json(run, [flight.scene for flight in page.view], everyone, fov)
+    views = plotly_scene.scene_json(run, [flight.scene for flight in page.view], everyone, fov)
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return f'{text[:-1]},"views":{views}}}'
 
@@ -377,7 +359,7 @@ def write_report(
 
 def _quality(page: ReportInput) -> tuple[Section, ...]:
     feeds = not page.run.info.setup.computer_on_ground
-    quality = quality_table(page.summary, computer=feeds)
+    quality = run_tables.quality_table(page.summary, computer=feeds)
     return tables_section(quality, conduct_table(page.run, page.summary))
 
 
@@ -406,19 +388,25 @@ class PageSection(NamedTuple):
 
 SECTIONS = (
     PageSection(
-        "setup", "What flew", lambda page: [Section("What flew", facts=setup_rows(page.run))]
+        "setup",
+        "What flew",
+        lambda page: [Section("What flew", facts=run_tables.setup_rows(page.run))],
     ),
     PageSection("quality", "Quality of flight", _quality),
-    PageSection("", "Faults", lambda page: tables_section(faults_table(page.run))),
+    PageSection("", "Faults", lambda page: tables_section(run_tables.faults_table(page.run))),
     PageSection(
-        "", "Real time", lambda page: tables_section(real_time_table(page.run, page.summary))
+        "",
+        "Real time",
+        lambda page: tables_section(run_tables.real_time_table(page.run, page.summary)),
     ),
     PageSection("worst", "Worst flights", _worst),
     PageSection("by-flight", "Flight by flight", by_flight_section),
     PageSection(
         "estimator",
         "Estimator",
-        lambda page: tables_section(estimation_table([each.tracked for each in page.view])),
+        lambda page: tables_section(
+            run_tables.estimation_table([each.tracked for each in page.view])
+        ),
     ),
     PageSection("latency", "Decision latency", latency_section),
     PageSection("energy", "Energy", energy_section),
@@ -457,7 +445,7 @@ def build_page(
         overview=overview,
         sections=sections,
         page_data=packed(page_data(page, drawn)),
-        library=packed(plotly_script()) if page.view else "",
+        library=packed(plotly_scene.plotly_script()) if page.view else "",
     )
     path = folder / document.REPORT_FILE
     replace_file(path, html.encode())

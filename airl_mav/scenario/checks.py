@@ -23,15 +23,8 @@ from airl_mav.policy.registry import PolicyInfo, load_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import SLOW, Renderer
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
+from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
-from airl_mav.scenario.model import (
-    Decisions,
-    Lateness,
-    LevelName,
-    PilotSettings,
-    Scenario,
-    WatchdogSettings,
-)
 
 SITL_SPEEDS = 0.5, 10.0
 """Speed range supported by MAVSDK's wall-clock timeouts: slower, it misses heartbeats (1 Hz of
@@ -48,7 +41,7 @@ REAL_FIRMWARE_NEEDS = {
 """Each kind of real firmware requires exactly one of its fields."""
 
 
-def check_level(scenario: Scenario) -> None:
+def check_level(scenario: model.Scenario) -> None:
     """Raise FieldError for a field that the level does not support."""
     level = scenario.level
     if level == "sitl":
@@ -58,8 +51,8 @@ def check_level(scenario: Scenario) -> None:
         if scenario.speed is not None and not low <= scenario.speed <= high:
             raise FieldError("speed", scenario.speed, f"{low:g} <= value <= {high:g} at level sitl")
     elif level == "gym":
-        usual = Scenario()
-        for field, declared in Scenario.model_fields.items():
+        usual = model.Scenario()
+        for field, declared in model.Scenario.model_fields.items():
             if NO_TWIN not in declared.metadata:
                 continue
             if (value := getattr(scenario, field)) != getattr(usual, field):
@@ -72,7 +65,7 @@ def check_level(scenario: Scenario) -> None:
         raise FieldError("workers", scenario.workers, "at level gym or lockstep")
 
 
-def check_start(scenario: Scenario) -> None:
+def check_start(scenario: model.Scenario) -> None:
     """Raise FieldError for a hover start incompatible with the firmware or a fault."""
     if scenario.start == "ground":
         return
@@ -85,13 +78,13 @@ def check_start(scenario: Scenario) -> None:
             )
 
 
-def check_drawing(renderer: Renderer, level: LevelName) -> None:
+def check_drawing(renderer: Renderer, level: model.LevelName) -> None:
     """Raise FieldError for a renderer that the level does not support."""
     if renderer in SLOW and level == TWIN:
         raise FieldError("renderer", renderer, "raycast, but at level lockstep or sitl")
 
 
-def check_faults(asked: Aircraft, level: LevelName) -> None:
+def check_faults(asked: Aircraft, level: model.LevelName) -> None:
     """Raise FieldError for a fault that the level or the firmware does not support."""
     if level == TWIN:
         check_twin(asked.faults)
@@ -137,7 +130,7 @@ def check_ports(ports: Ports, *, any_camera: bool) -> None:
         raise FieldError("ports.gcs_port", ports.gcs_port, "another than that of the onboard API")
 
 
-def check_firmware(asked: Aircraft, level: LevelName, speed: float | str | None) -> None:
+def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str | None) -> None:
     """Raise FieldError for options that real firmware does not support; None: default speed."""
     firmware, real = asked.firmware, asked.real
     if asked.signing_key is not None and (level != "sitl" or firmware != "builtin"):
@@ -182,8 +175,8 @@ TRANSPORT_US = round(5.0 * US_PER_MS)
 
 
 def decide_piloting(
-    asked: Decisions, policy: PolicyInfo, goal_radius_m: float
-) -> tuple[PilotSettings, WatchdogSettings]:
+    asked: model.Decisions, policy: PolicyInfo, goal_radius_m: float
+) -> tuple[model.PilotSettings, model.WatchdogSettings]:
     """Return the flight settings of a policy: as configured, else from its card, else defaults.
 
     `goal_radius_m` applies to a policy without a card. Raises FieldError if a decision would be
@@ -205,9 +198,9 @@ def decide_piloting(
             "compensate": card.compensate,
         }
         hover_s = card.hover_after_s if hover_s is None else hover_s
-    names = asdict(PilotSettings()).keys() - {"commands"}
+    names = asdict(model.PilotSettings()).keys() - {"commands"}
     given = {name: value for name in names if (value := getattr(asked, name)) is not None}
-    pilot = PilotSettings(commands=policy.commands, **(known | given))
+    pilot = model.PilotSettings(commands=policy.commands, **(known | given))
     if pilot.decisions == "pipelined" and hover_s is not None:
         raise FieldError(
             "decisions", pilot.decisions, "without watchdog.hover_after_s, as no hold ends"
@@ -239,7 +232,9 @@ def check_commands(
     raise FieldError("policy", asked, f"one that commands {kind.title}, {accepted}")
 
 
-def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile) -> None:
+def check_compensated(
+    pilot: model.PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile
+) -> None:
     """Raise FieldError for unsupported latency compensation.
 
     Compensation does not support policies without velocity commands, whose effect is not predicted,
@@ -277,7 +272,7 @@ def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object)
         )
 
 
-def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> None:
+def check_quota(asked: model.Decisions, injection: Injection, level: model.LevelName) -> None:
     """Raise UsageError for a processor limit without effect, or without permission."""
     if asked.cpu_quota is None:
         return
@@ -291,7 +286,9 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
     check_permitted(asked.cpu_quota)
 
 
-def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
+def select_latency(
+    asked: model.Lateness, policy: PolicyInfo, *, on_this_computer: bool
+) -> Injection:
     """Return the latency of a stand-alone companion.
 
     `on_this_computer`: the companion runs on the selected computer itself, so that measured
@@ -306,7 +303,9 @@ def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: boo
     )
 
 
-def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed: int) -> Policy:
+def load_asked_policy(
+    asked: model.Decisions, policy: PolicyInfo, hold_s: float, seed: int
+) -> Policy:
     """Return the configured policy, ready to decide. Raises UsageError."""
     return load_policy(
         policy,
@@ -324,10 +323,10 @@ def action_generator(seed: int) -> np.random.Generator:
     return np.random.default_rng((seed, ACTION_STREAM))
 
 
-def between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
+def between_commands(pilot: model.PilotSettings, hover_s: float | None) -> str:
     """Return the behaviour between commands as text."""
     words = ["persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms"]
-    if pilot.decisions != PilotSettings.decisions:
+    if pilot.decisions != model.PilotSettings.decisions:
         words.append(f"{pilot.decisions} decisions")
     if pilot.compensate:
         words.append("latency compensated")

@@ -38,24 +38,8 @@ from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario import checks
 from airl_mav.scenario.aircraft import FirmwareName, PlantName
-from airl_mav.scenario.checks import (
-    NATIVE_T2_US,
-    action_generator,
-    between_commands,
-    check_commands,
-    check_compensated,
-    check_firmware,
-    check_fitted,
-    check_goal_height,
-    check_level,
-    check_plant,
-    check_ports,
-    check_quota,
-    check_start,
-    decide_piloting,
-    load_asked_policy,
-)
 from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.scenario_file import anchored
 
@@ -106,33 +90,33 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
     or the policy cannot be used, or the first seed has no valid arena. `FieldError`s name the
     field.
     """
-    check_level(scenario)
+    checks.check_level(scenario)
     if scenario.level != "gym":
-        check_plant(scenario)
-    check_firmware(scenario, scenario.level, scenario.speed)
-    check_start(scenario)
+        checks.check_plant(scenario)
+    checks.check_firmware(scenario, scenario.level, scenario.speed)
+    checks.check_start(scenario)
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: 0, any free port, is invalid here.
-        check_ports(scenario.open_ports, any_camera=False)
+        checks.check_ports(scenario.open_ports, any_camera=False)
     policy = policy or find_policy(scenario.policy, trust=scenario.trust)
-    check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
-    pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
+    checks.check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
+    pilot, watchdog = checks.decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)
     further = vehicle.cameras.values()
     check_noise(vehicle.camera, scenario.sensors, scenario.faults, further=further)
-    check_fitted(vehicle.sensors, scenario.faults)
+    checks.check_fitted(vehicle.sensors, scenario.faults)
     if reason := camera_refused(policy, vehicle):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
         )
-    check_compensated(pilot, policy, vehicle)
+    checks.check_compensated(pilot, policy, vehicle)
     arena = load_profile("arenas", scenario.arena, ArenaSpec)
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
     check_renderer(vehicle.camera, scenario.renderer, arena, further)
-    check_quota(scenario, injection, scenario.level)
+    checks.check_quota(scenario, injection, scenario.level)
     resolved = ResolvedScenario(
         scenario=scenario,
         vehicle=vehicle,
@@ -146,7 +130,7 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
     compile_shown([plan_of(resolved)])
     # Load everything now, so that errors precede the flight.
     goal = resolved.arena_of(scenario.seed).goal_point
-    check_goal_height(policy, goal, "arena", scenario.arena)
+    checks.check_goal_height(policy, goal, "arena", scenario.arena)
     if policy.asked is None:
         resolved.fresh_policy(scenario.seed)
     resolved.compensator()
@@ -163,7 +147,7 @@ def _labelled(injection: Injection, scenario: Scenario) -> Injection:
         return replace(injection, label=label)
     if scenario.level == "sitl":
         return injection
-    return without_timing(injection, NATIVE_T2_US / 1e3, scenario.level)
+    return without_timing(injection, checks.NATIVE_T2_US / 1e3, scenario.level)
 
 
 HOVER_START_S = 0.3
@@ -339,7 +323,7 @@ class ResolvedScenario:
             computer_on_ground=self.computer.ground_equipment,
             injection=self.injection,
             speed=self.speed,
-            between_commands=between_commands(self.pilot, hover_s),
+            between_commands=checks.between_commands(self.pilot, hover_s),
             conditions=", ".join(self._conditions()),
         )
 
@@ -377,7 +361,7 @@ class ResolvedScenario:
         desktop computer's.
         """
         sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
-        return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
+        return sampler if native else sampler or FixedSampler(checks.NATIVE_T2_US)
 
     def compensator(self) -> Compensator | None:
         """Return the compensator of a companion, or None. Raises FieldError."""
@@ -389,7 +373,7 @@ class ResolvedScenario:
         """Return the policy at the start of a seed's flight. Raises UsageError."""
         loaded = self._loaded_policy
         if isinstance(loaded, LearnedPolicy):
-            return loaded.with_generator(action_generator(seed))
+            return loaded.with_generator(checks.action_generator(seed))
         return self._load_policy()
 
     @cached_property
@@ -399,7 +383,7 @@ class ResolvedScenario:
 
     def _load_policy(self) -> Policy:
         scenario = self.scenario
-        return load_asked_policy(scenario, self.policy, self.pilot.hold_s, scenario.seed)
+        return checks.load_asked_policy(scenario, self.policy, self.pilot.hold_s, scenario.seed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Exclude the loaded network: each process opens a new one."""

@@ -14,25 +14,8 @@ from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.core.frames import Goal
 from airl_mav.faults import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
+from airl_mav.scenario import checks, model
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.checks import (
-    TRANSPORT_US,
-    check_drawing,
-    check_faults,
-    check_firmware,
-    check_plant,
-    check_ports,
-)
-from airl_mav.scenario.model import (
-    DEFAULT_ARENA,
-    DEFAULT_POLICY,
-    GREATEST_SEED,
-    ArenaName,
-    Decisions,
-    Lateness,
-    LevelName,
-    PolicyName,
-)
 
 SPEEDS = 0.0, 100.0
 """Limits of the speed; time beyond the host's capacity is skipped and reported."""
@@ -57,14 +40,14 @@ FARTHEST_M = 10_000.0
 class StandAloneVehicle(Aircraft):
     """Flight controller, vehicle and camera without a companion, for any client."""
 
-    arena: ArenaName = DEFAULT_ARENA
+    arena: model.ArenaName = model.DEFAULT_ARENA
     computer: str = Field(
         default="workstation",
         description="computer profile that is on board, for its mass and its power: a shipped name,"
         " or a path to a .toml",
     )
     seed: int = quantity(
-        "seed of arena, sensors, wind and spread", "1", ge=0, le=GREATEST_SEED, default=1
+        "seed of arena, sensors, wind and spread", "1", ge=0, le=model.GREATEST_SEED, default=1
     )
     speed: float | Literal["max"] | None = optional(
         "simulated seconds per wall second, above 0, at most 100; max: as fast as it"
@@ -96,7 +79,7 @@ class StandAloneVehicle(Aircraft):
         "ms",
         ge=0,
         le=1000,
-        default=TRANSPORT_US / US_PER_MS,
+        default=checks.TRANSPORT_US / US_PER_MS,
     )
     turn_us: int = quantity(
         "in lockstep: a companion that does not say when it wants its next turn has it this long"
@@ -165,14 +148,14 @@ class CompanionAddresses(ProfileModel):
     camera: CameraName = "tcp://127.0.0.1:5600"
 
 
-class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
+class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
     """Stand-alone companion that flies a policy, onboard or against any simulator."""
 
     signing_key: Path | None = optional(
         "sign MAVLink with the key in this file, that of the flight controller (64"
         " hexadecimal digits, mode 0600); over udpin:// only"
     )
-    policy: PolicyName = DEFAULT_POLICY
+    policy: model.PolicyName = model.DEFAULT_POLICY
     goal: Goal = Field(
         default=(20.0, 0.0),
         description="goal, north and east of the start, m, within 10 km; with a third number, down:"
@@ -208,7 +191,7 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         "seed of the injected latency, and of random actions if the policy's card has any",
         "1",
         ge=0,
-        le=GREATEST_SEED,
+        le=model.GREATEST_SEED,
         default=1,
     )
     connect_timeout: float = quantity(
@@ -240,21 +223,21 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
 
 def check_vehicle(asked: StandAloneVehicle) -> None:
     """Raise FieldError for errors detectable before a port is bound."""
-    check_ports(asked.open_ports, any_camera=True)
+    checks.check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
-    level: LevelName = "lockstep" if asked.lockstep else "sitl"
+    level: model.LevelName = "lockstep" if asked.lockstep else "sitl"
     if asked.signing_key is not None and asked.firmware != "builtin":
         raise FieldError("signing_key", asked.signing_key, "with firmware builtin")
-    check_plant(asked)
-    check_firmware(asked, "sitl", speed)
+    checks.check_plant(asked)
+    checks.check_firmware(asked, "sitl", speed)
     if asked.lockstep and asked.firmware != "builtin":
         raise FieldError(
             "firmware",
             asked.firmware,
             "without lockstep; PX4 is flown in lockstep by airl-sitl and from Python",
         )
-    check_faults(asked, level)
-    check_drawing(asked.renderer, level)
+    checks.check_faults(asked, level)
+    checks.check_drawing(asked.renderer, level)
     for fault in asked.faults:
         if fault.part in PROCESSES:
             raise FieldError(

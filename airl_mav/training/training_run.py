@@ -34,6 +34,7 @@ from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import SHIPPED
 from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.run_folder import locked
+from airl_mav.training import training_folder
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import (
@@ -45,12 +46,6 @@ from airl_mav.training.config import (
 )
 from airl_mav.training.export import export_sb3
 from airl_mav.training.onnx_export import GreedyDecisions
-from airl_mav.training.training_folder import (
-    BEST_MODEL,
-    Evaluation,
-    TrainingFolder,
-    TrainingProgress,
-)
 
 
 def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
@@ -60,7 +55,7 @@ def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) ->
     is the initial log standard deviation of continuous actions; None = the run's. Raises UsageError
     for another run, or if the weights do not fit.
     """
-    folder = TrainingFolder(run)
+    folder = training_folder.TrainingFolder(run)
     learned = folder.about()["config"]["algorithm"]["name"]
     if folder.best() is None:
         raise UsageError(f"initial = '{run}': no weights yet; accepted: a run that was evaluated")
@@ -88,8 +83,8 @@ LOG_EVERY = 100
 class TrainingResult(NamedTuple):
     """Result of a training run."""
 
-    folder: TrainingFolder
-    best: Evaluation
+    folder: training_folder.TrainingFolder
+    best: training_folder.Evaluation
     card: PolicyCard
 
 
@@ -104,7 +99,7 @@ def train(
     *,
     name: str,
     resume: bool = False,
-    progress: TrainingProgress | None = None,
+    progress: training_folder.TrainingProgress | None = None,
     device: str = "cpu",
     command: str = "airl_mav.training.training_run.train",
     view: ViewAddresses | None = None,
@@ -121,11 +116,11 @@ def train(
     """
     check_fields(config.algorithm)
     config = config.model_copy(update={"environment": bounded(config.environment)})
-    progress = progress or TrainingProgress()
+    progress = progress or training_folder.TrainingProgress()
     with locked(out, progress.waiting):
-        if not TrainingFolder(out).begun:
+        if not training_folder.TrainingFolder(out).begun:
             check_trainable(config, name, device)  # before there is a run in the folder
-        folder = TrainingFolder.begin(out, config, command, resume=resume)
+        folder = training_folder.TrainingFolder.begin(out, config, command, resume=resume)
         if view is None:
             best = fit(config, folder, progress, device)
         else:
@@ -163,11 +158,11 @@ def learner_of(config: TrainingConfig, env: NavigationVecEnv, device: str) -> Ba
 
 def fit(
     config: TrainingConfig,
-    folder: TrainingFolder,
-    progress: TrainingProgress,
+    folder: training_folder.TrainingFolder,
+    progress: training_folder.TrainingProgress,
     device: str,
     watcher: Watcher | None = None,
-) -> Evaluation:
+) -> training_folder.Evaluation:
     """Train in a locked folder from the newest checkpoint; return the best weights' evaluation.
 
     Raises UsageError if the algorithm does not fit the environment, an arena cannot be generated,
@@ -204,8 +199,8 @@ class _BetweenRollouts(BaseCallback):
     def __init__(
         self,
         config: TrainingConfig,
-        folder: TrainingFolder,
-        progress: TrainingProgress,
+        folder: training_folder.TrainingFolder,
+        progress: training_folder.TrainingProgress,
         env: NavigationVecEnv,
     ) -> None:
         super().__init__()
@@ -257,7 +252,7 @@ class _BetweenRollouts(BaseCallback):
             kept = self._folder.zone(self._zone)
             self._zone += 1
             save_checkpoint(kept, self.model, self._meta())
-            replace_file(kept / BEST_MODEL, model_bytes(self.model))
+            replace_file(kept / training_folder.BEST_MODEL, model_bytes(self.model))
 
     # --- SB3's hooks
 
@@ -334,10 +329,10 @@ def summary(
     seconds: float,
     training_success: float | None,
     zone: int | None,
-) -> Evaluation:
+) -> training_folder.Evaluation:
     """Return the summary of evaluation flights."""
     crashed = sum(each.verdict == FlightStatus.COLLISION for each in flown)
-    return Evaluation(
+    return training_folder.Evaluation(
         steps=steps,
         seconds=seconds,
         episodes=len(flown),
@@ -357,7 +352,9 @@ def model_bytes(model: BaseAlgorithm) -> bytes:
     return buffer.getvalue()
 
 
-def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> PolicyCard:
+def export_best(
+    folder: training_folder.TrainingFolder, config: TrainingConfig, name: str
+) -> PolicyCard:
     """Export the best weights of a run to its `policy` folder. Raises UsageError if it cannot."""
     best, about = folder.best(), folder.about()
     assert best is not None  # noqa: S101 - a finished run has one

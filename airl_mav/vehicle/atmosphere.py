@@ -6,38 +6,36 @@ import math
 
 import numpy as np
 
-from airl_mav.core.constants import (
-    GAS_CONSTANT_AIR,
-    GRAVITY_M_S2,
-    SEA_LEVEL_PRESSURE_HPA,
-    SEA_LEVEL_TEMPERATURE_K,
-    TEMPERATURE_LAPSE_K_M,
-    TICK_S,
-    ZERO_CELSIUS_K,
-)
+from airl_mav.core import constants
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.conditions import WindSettings
 
-_EXPONENT = GRAVITY_M_S2 / (GAS_CONSTANT_AIR * TEMPERATURE_LAPSE_K_M)
+_EXPONENT = constants.GRAVITY_M_S2 / (constants.GAS_CONSTANT_AIR * constants.TEMPERATURE_LAPSE_K_M)
 
 
 def pressure_hpa(altitude_m: float) -> float:
     """Return the static pressure [hPa] at an altitude above mean sea level [m]."""
-    ratio = 1.0 - TEMPERATURE_LAPSE_K_M * altitude_m / SEA_LEVEL_TEMPERATURE_K
-    return float(SEA_LEVEL_PRESSURE_HPA * ratio**_EXPONENT)
+    ratio = 1.0 - constants.TEMPERATURE_LAPSE_K_M * altitude_m / constants.SEA_LEVEL_TEMPERATURE_K
+    return float(constants.SEA_LEVEL_PRESSURE_HPA * ratio**_EXPONENT)
 
 
 def altitude_m(pressure: float) -> float:
     """Return the altitude above mean sea level [m] of a static pressure [hPa]."""
-    ratio = (pressure / SEA_LEVEL_PRESSURE_HPA) ** (1.0 / _EXPONENT)
-    return float((1.0 - ratio) * SEA_LEVEL_TEMPERATURE_K / TEMPERATURE_LAPSE_K_M)
+    ratio = (pressure / constants.SEA_LEVEL_PRESSURE_HPA) ** (1.0 / _EXPONENT)
+    return float(
+        (1.0 - ratio) * constants.SEA_LEVEL_TEMPERATURE_K / constants.TEMPERATURE_LAPSE_K_M
+    )
 
 
 def temperature_c(altitude: float) -> float:
     """Return the air temperature [°C] at an altitude above mean sea level [m]."""
-    return SEA_LEVEL_TEMPERATURE_K - TEMPERATURE_LAPSE_K_M * altitude - ZERO_CELSIUS_K
+    return (
+        constants.SEA_LEVEL_TEMPERATURE_K
+        - constants.TEMPERATURE_LAPSE_K_M * altitude
+        - constants.ZERO_CELSIUS_K
+    )
 
 
 BLOCK = 256
@@ -72,7 +70,7 @@ class Wind:
     """Steady wind plus first-order Gauss-Markov gusts (the first-order form of Dryden's model)."""
 
     def __init__(
-        self, settings: WindSettings, rng: np.random.Generator, tick_s: float = TICK_S
+        self, settings: WindSettings, rng: np.random.Generator, tick_s: float = constants.TICK_S
     ) -> None:
         """Begin an episode with settings from `wind_of_episode`; `rng` draws the gusts."""
         self.steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])

@@ -9,24 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from airl_mav.core import frames
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import (
-    HOME,
-    MAGNETIC_DECLINATION,
-    MAGNETIC_FIELD_NED,
-    Geodetic,
-    Vector,
-    local_to_geodetic,
-    quat_from_euler,
-)
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.atmosphere import altitude_m
 from airl_mav.vehicle.rotation import Quat, rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record
 
-STRENGTH_GAUSS = float(np.linalg.norm(MAGNETIC_FIELD_NED))
-INCLINATION_RAD = math.asin(MAGNETIC_FIELD_NED[2] / STRENGTH_GAUSS)
+STRENGTH_GAUSS = float(np.linalg.norm(frames.MAGNETIC_FIELD_NED))
+INCLINATION_RAD = math.asin(frames.MAGNETIC_FIELD_NED[2] / STRENGTH_GAUSS)
 """Inclination [rad], positive down."""
 
 _LEAST_GAUSS = 1e-4
@@ -57,7 +49,7 @@ class FieldCheck(NamedTuple):
             math.radians(value("EKF2_MAG_CHK_INC")),
         )
 
-    def disturbed(self, field: Vector, attitude: Quat) -> bool:
+    def disturbed(self, field: frames.Vector, attitude: Quat) -> bool:
         """Return whether a measured field (3,) FRD [gauss] differs from the earth's field.
 
         The heading of the attitude, body to world, has no effect.
@@ -95,10 +87,10 @@ _NO_COMPASS = 5
 class Aligned(NamedTuple):
     """Result of the alignment."""
 
-    quaternion: Vector  # (4,) body -> NED
+    quaternion: frames.Vector  # (4,) body -> NED
     altitude_baro_m: float
     """Pressure altitude in the standard atmosphere, from the barometer [m]."""
-    fix: Geodetic | None
+    fix: frames.Geodetic | None
     """GPS position; None if the alignment did not require GPS."""
     by_compass: bool
     """True if the heading comes from the compass; False: the heading is 0."""
@@ -111,7 +103,7 @@ class Alignment:
         """Start without samples. The flight controller's record holds the sums of all samples."""
         self._value = value
         self._record = record
-        self.field: Vector | None = None
+        self.field: frames.Vector | None = None
         """Mean field (3,) FRD [gauss], also set if the field is too disturbed to use."""
 
     def finish(self) -> Aligned | None:
@@ -131,17 +123,21 @@ class Alignment:
         by_compass, heading = COMPASS in needed, 0.0
         if by_compass:
             # The field in a frame with heading 0 gives the heading directly.
-            level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
+            level = tuple(frames.quat_from_euler(roll, pitch, 0.0).tolist())
             self.field = field = sums[_FIELD] / counts[COMPASS]
             if FieldCheck.read(self._value).disturbed(field, level):
                 # A wrong heading would stay unnoticed until the vehicle moves.
                 self._restart()
                 return None
-            heading = es.true_heading(field, level, MAGNETIC_DECLINATION)
+            heading = es.true_heading(field, level, frames.MAGNETIC_DECLINATION)
         # Mean of altitudes, not of pressures: altitude is not linear in pressure.
         altitude_m = sums.item(_ALTITUDE) / counts[BAROMETER]
-        fix = local_to_geodetic(sums[_PLACE] / counts[FIXES], HOME) if FIXES in needed else None
-        return Aligned(quat_from_euler(roll, pitch, heading), altitude_m, fix, by_compass)
+        fix = (
+            frames.local_to_geodetic(sums[_PLACE] / counts[FIXES], frames.HOME)
+            if FIXES in needed
+            else None
+        )
+        return Aligned(frames.quat_from_euler(roll, pitch, heading), altitude_m, fix, by_compass)
 
     def _needed(self) -> tuple[int, ...]:
         """Return the slow sensors that must deliver at least one sample.

@@ -10,6 +10,8 @@ from airl_mav.control.loops import Motors
 from airl_mav.control.memory import ticks_to_motors
 from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
+from firmware_sim import interfaces
+from firmware_sim.autopilot import commander, inputs
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     OperatorText,
@@ -19,15 +21,6 @@ from firmware_sim.autopilot.autopilot_state import (
     Wire,
 )
 from firmware_sim.autopilot.climb import DECIDE_US, climb_record
-from firmware_sim.autopilot.commander import (
-    COMMANDED,
-    READINESS,
-    Ask,
-    CommanderEvent,
-    CommanderState,
-    FlightPhase,
-    unavailable,
-)
 from firmware_sim.autopilot.error_state import RATES, KernelFilter, NewFilter, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
@@ -37,16 +30,6 @@ from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.flight_modes import WITH_STICKS, Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
-from firmware_sim.autopilot.inputs import (
-    FollowedTarget,
-    LandingTarget,
-    ManualControl,
-    ModeRequest,
-    ObstacleBins,
-    PositionYaw,
-    Source,
-    Sticks,
-)
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
 from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
@@ -56,18 +39,12 @@ from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
 from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    LogStore,
-    SensorSample,
-    TrueState,
-)
 
 if TYPE_CHECKING:
     from firmware_sim.fault_timeline import ClientFaults
 
 # Bound once: looking up an enum member in every tick is slow.
-_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
+_GROUND, _AIR = commander.FlightPhase.GROUND, commander.FlightPhase.AIR
 
 
 class BuiltinAutopilot:
@@ -94,7 +71,7 @@ class BuiltinAutopilot:
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._guidance.context.missions = self._navigator.missions
-        self._manual_control = ManualControl(value)
+        self._manual_control = inputs.ManualControl(value)
         self._events: list[Told] = []
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
         """Failsafe and pre-arm checks."""
@@ -110,7 +87,7 @@ class BuiltinAutopilot:
         """Time of the newest sample in the estimator [µs]."""
         self._due_us: float = 0
         """Time of the next decision [µs]."""
-        self._decided_on: tuple[CommanderState | None, object] = (None, None)
+        self._decided_on: tuple[commander.CommanderState | None, object] = (None, None)
         """Commander state and setpoint at the newest decision."""
         self._decided_healthy = 0
         """Health of the estimator at the newest decision, 0 or 1."""
@@ -139,7 +116,7 @@ class BuiltinAutopilot:
         """Kinds of client sensors that were reported as not fused."""
         self.failures: ClientFaults | None = None
         """Failure injection for client requests; None: not supported. Set by the simulation."""
-        self.logs = LogStore()
+        self.logs = interfaces.LogStore()
         """Flight logs for clients. Set by the log writer."""
         self.on_setpoint: Callable[[Wire, int], None] | None = None
         """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
@@ -149,7 +126,7 @@ class BuiltinAutopilot:
 
     # --- towards the plant
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Process one tick's sensors; return the motor commands until the next tick."""
         self.take(sample)
         self.decide_if_due()
@@ -161,11 +138,11 @@ class BuiltinAutopilot:
             control_record(self.record)
         if detect_record(self.record):
             self._handle_detected()
-        return ActuatorControls(
+        return interfaces.ActuatorControls(
             sample.time_us, self._motors, self._commander.flight.phase >= _GROUND
         )
 
-    def take(self, sample: SensorSample) -> None:
+    def take(self, sample: interfaces.SensorSample) -> None:
         """Update the estimate with one tick's sensors. Repeated calls have no effect."""
         # The tick may already be in the estimate from compiled ticks.
         if sample.time_us == self._taken_us:
@@ -193,14 +170,16 @@ class BuiltinAutopilot:
             self._navigator.due_us = 0
         # Order: mode end, home, readiness, failsafes, navigation, then the demand.
         if self._commander.flight.phase is _AIR and self._guidance.is_done(self._state):
-            self._commander.handle(CommanderEvent.MODE_DONE)
+            self._commander.handle(commander.CommanderEvent.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
             # While armed, home stays at the place of arming.
             if self._commander.flight.phase < _GROUND:
                 self._home.set_here()
             else:
                 self._home.locate()
-        readiness = READINESS[self._commander.flight.phase][self.record["healthy"].item(0)]
+        readiness = commander.READINESS[self._commander.flight.phase][
+            self.record["healthy"].item(0)
+        ]
         if readiness is not None:
             self._commander.handle(readiness)
         looks = time_us >= supervisor.next_us
@@ -315,7 +294,7 @@ class BuiltinAutopilot:
         if not steady:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
-    def fuse(self, sample: SensorSample, left: int) -> None:
+    def fuse(self, sample: interfaces.SensorSample, left: int) -> None:
         """Fuse the measurements of a sample that a compiled tick leaves to Python.
 
         `left` has the bits of the remaining work, from `engine.ticks.estimate`.
@@ -324,7 +303,7 @@ class BuiltinAutopilot:
         sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
         self.estimator.fuse_rest(sensors.trusted(sample) if sensors.distrusted else sample)
 
-    def flown(self, read: Callable[[], SensorSample], event: int) -> bool:
+    def flown(self, read: Callable[[], interfaces.SensorSample], event: int) -> bool:
         """Process the results of compiled ticks; return whether the commander's state has changed.
 
         `read` returns the newest sample, which is already in the estimate; `event` ended the ticks.
@@ -369,10 +348,10 @@ class BuiltinAutopilot:
         """Return whether the navigator has no work, as in its newest step."""
         return self._navigator.idle and self._navigates_on() == self._navigated_on
 
-    def _return_place(self) -> PositionYaw | None:
+    def _return_place(self) -> inputs.PositionYaw | None:
         """Return the destination of Return: home, or the place selected by RTL_TYPE."""
         context, now = self._guidance.context, self._situation()
-        home = PositionYaw(context.home, context.home_yaw)
+        home = inputs.PositionYaw(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
 
     def _situation(self) -> NavigationState | None:
@@ -380,7 +359,9 @@ class BuiltinAutopilot:
 
     def _handle_detected(self) -> None:
         landed = self._commander.flight.phase is _AIR
-        self._commander.handle(CommanderEvent.LANDED if landed else CommanderEvent.LIFTED)
+        self._commander.handle(
+            commander.CommanderEvent.LANDED if landed else commander.CommanderEvent.LIFTED
+        )
 
     # --- texts
 
@@ -411,12 +392,12 @@ class BuiltinAutopilot:
             self.say(message)
 
     @property
-    def flight(self) -> CommanderState:
+    def flight(self) -> commander.CommanderState:
         """Commander state."""
         return self._commander.flight
 
     @property
-    def sample(self) -> SensorSample | None:
+    def sample(self) -> interfaces.SensorSample | None:
         """Sensors of the newest tick; None before the first."""
         return self._newest.sample
 
@@ -446,7 +427,7 @@ class BuiltinAutopilot:
         """The autopilot itself: all internals are accessible."""
         return self
 
-    def use_truth(self, truth: Callable[[], TrueState]) -> None:
+    def use_truth(self, truth: Callable[[], interfaces.TrueState]) -> None:
         """Ignore the true state: the autopilot flies by its estimate."""
 
     def close(self) -> None:
@@ -473,22 +454,24 @@ class BuiltinAutopilot:
         del force
         # Without samples or when armed already, no check applies: the commander answers.
         if self.sample is None or self.flight.phase >= _GROUND:
-            return self._commander.handle(CommanderEvent.ARM)
+            return self._commander.handle(commander.CommanderEvent.ARM)
         # Check now: the newest result may be up to a period old.
         self._look_anew(self.flight.mode)
         refusals = self.supervisor.refusals(self.sample, self.flight)
         self._say_all(refusals)
         return self._commander.handle(
-            CommanderEvent.ARM_UNREADY if refusals else CommanderEvent.ARM
+            commander.CommanderEvent.ARM_UNREADY if refusals else commander.CommanderEvent.ARM
         )
 
     def terminate(self) -> Result:
         """Request permanent motor stop (MAV_CMD_DO_FLIGHTTERMINATION)."""
-        return self._commander.handle(Ask(Mode.TERMINATION))
+        return self._commander.handle(commander.Ask(Mode.TERMINATION))
 
     def disarm(self, *, force: bool) -> Result:
         """Request disarming; force = kill, also in the air."""
-        return self._commander.handle(CommanderEvent.KILL if force else CommanderEvent.DISARM)
+        return self._commander.handle(
+            commander.CommanderEvent.KILL if force else commander.CommanderEvent.DISARM
+        )
 
     def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
         """Request a take-off to a height above home [m] and a place, local NED north, east [m].
@@ -500,7 +483,7 @@ class BuiltinAutopilot:
         return self._ask(Mode.TAKEOFF)
 
     def set_mode(
-        self, mode: Mode, request: ModeRequest | None = None, *, commanded: bool = False
+        self, mode: Mode, request: inputs.ModeRequest | None = None, *, commanded: bool = False
     ) -> Result:
         """Request a mode with its optional arguments.
 
@@ -508,13 +491,16 @@ class BuiltinAutopilot:
         """
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
-        return self._ask(mode, request, COMMANDED.get(mode) if commanded else None)
+        return self._ask(mode, request, commander.COMMANDED.get(mode) if commanded else None)
 
     def _ask(
-        self, mode: Mode, request: ModeRequest | None = None, granted: OperatorText | None = None
+        self,
+        mode: Mode,
+        request: inputs.ModeRequest | None = None,
+        granted: OperatorText | None = None,
     ) -> Result:
         if not self._guidance.flies(mode):
-            self.say(unavailable(mode))
+            self.say(commander.unavailable(mode))
             return Result.TEMPORARILY_REJECTED
         self._look_anew(mode)
         # The geofence may forbid the place of the request.
@@ -523,7 +509,7 @@ class BuiltinAutopilot:
         available = self.supervisor.available(mode)
         if mode in WITH_STICKS:
             available = available and self._manual_control.sticks(self._now_us) is not None
-        return self._commander.handle(Ask(mode, available), request, granted)
+        return self._commander.handle(commander.Ask(mode, available), request, granted)
 
     def change_speed(self, speed_m_s: float) -> None:
         """Set the horizontal speed of the present automatic mode [m/s]."""
@@ -537,7 +523,7 @@ class BuiltinAutopilot:
         # -1 means the current item.
         if not -1 <= index < len(self.plans.mission):
             return Result.DENIED
-        self._commander.handle(Ask(Mode.MISSION))
+        self._commander.handle(commander.Ask(Mode.MISSION))
         if self.flight.phase < _GROUND and self.arm(force=False) is not Result.ACCEPTED:
             return Result.TEMPORARILY_REJECTED
         if index >= 0:
@@ -598,7 +584,7 @@ class BuiltinAutopilot:
         """Record the reason of a rejected offboard setpoint, which the next failsafe names."""
         self._commander.refusal = reason, time_us
 
-    def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
+    def manual_control(self, sticks: inputs.Sticks, source: inputs.Source, time_us: int) -> None:
         """Pass on the pilot's sticks, received at `time_us` of simulated time."""
         moved = self._manual_control.offer(sticks, source, time_us)
         self.supervisor.watch.hear_pilot(time_us)
@@ -611,7 +597,7 @@ class BuiltinAutopilot:
             self._commander.obey(Intervention(sticks_moved=True))
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
-            self._commander.handle(Ask(Mode.POSITION))
+            self._commander.handle(commander.Ask(Mode.POSITION))
             self.say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
     def receive(self, name: str, reading: Any) -> None:
@@ -621,15 +607,15 @@ class BuiltinAutopilot:
             self._unfused.add(name)
             self.say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
 
-    def see_obstacles(self, obstacles: ObstacleBins) -> None:
+    def see_obstacles(self, obstacles: inputs.ObstacleBins) -> None:
         """Pass on the distances to obstacles."""
         self._guidance.context.obstacles = obstacles
 
-    def follow(self, target: FollowedTarget) -> None:
+    def follow(self, target: inputs.FollowedTarget) -> None:
         """Pass on the position of the Follow target."""
         self._guidance.context.target = target
 
-    def landing_target(self, target: LandingTarget) -> None:
+    def landing_target(self, target: inputs.LandingTarget) -> None:
         """Pass on the position of the precision landing target."""
         self._guidance.context.landing_target = target
 

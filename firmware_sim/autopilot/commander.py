@@ -12,14 +12,7 @@ from enum import Enum, IntEnum, auto
 from functools import partial
 from typing import NamedTuple
 
-from firmware_sim.autopilot.autopilot_state import (
-    Arming,
-    CommanderStatus,
-    Landed,
-    OperatorText,
-    Result,
-    Severity,
-)
+from firmware_sim.autopilot import autopilot_state
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import ArmingReason, words
 from firmware_sim.autopilot.flight_modes import Mode
@@ -100,21 +93,21 @@ class TransitionCell:
     """Next mode, requested by the user; None = unchanged."""
     restores_mode: bool = False
     """True if the vehicle is disarmed and returns to the last lasting mode."""
-    result: Result = Result.ACCEPTED
-    text: OperatorText | None = None
+    result: autopilot_state.Result = autopilot_state.Result.ACCEPTED
+    text: autopilot_state.OperatorText | None = None
 
 
 Row = dict[FlightPhase, TransitionCell]
 """Effects of an event by phase; without effect in other phases."""
 
-_info = partial(OperatorText.of, Severity.INFO)
-_critical = partial(OperatorText.of, Severity.CRITICAL)
-_TEMP = Result.TEMPORARILY_REJECTED
+_info = partial(autopilot_state.OperatorText.of, autopilot_state.Severity.INFO)
+_critical = partial(autopilot_state.OperatorText.of, autopilot_state.Severity.CRITICAL)
+_TEMP = autopilot_state.Result.TEMPORARILY_REJECTED
 _B, _S, _G, _A = FlightPhase
 _NO_ARM = TransitionCell(result=_TEMP, text=_critical(events.ARM_DENIED))
 
 
-def unavailable(mode: Mode) -> OperatorText:
+def unavailable(mode: Mode) -> autopilot_state.OperatorText:
     """Return the text for the rejection of a mode."""
     text = f"Switching to {mode.spec.title} is currently not available"
     return _critical(events.MODE_NOT_AVAILABLE, mode.spec.custom_mode, mode.spec.event, text=text)
@@ -145,7 +138,7 @@ COMMANDED = {
 
 _ARMED = _info(events.ARMED_BY, ArmingReason.COMMAND_EXTERNAL, text="Armed by external command")
 _DISARMED, _LOCKED = _disarm(ArmingReason.COMMAND_EXTERNAL), _disarm(ArmingReason.LOCKDOWN)
-_CUT, _DENIED = _disarm(ArmingReason.FAILSAFE), TransitionCell(result=Result.DENIED)
+_CUT, _DENIED = _disarm(ArmingReason.FAILSAFE), TransitionCell(result=autopilot_state.Result.DENIED)
 _NOT_LANDED = TransitionCell(result=_TEMP, text=_critical(events.DISARM_DENIED))
 
 TABLE: dict[Ask | CommanderEvent, Row] = {
@@ -186,8 +179,8 @@ class EventOutcome:
     """Outcome of an event."""
 
     flight: CommanderState
-    result: Result
-    text: OperatorText | None
+    result: autopilot_state.Result
+    text: autopilot_state.OperatorText | None
 
 
 def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutcome:
@@ -197,7 +190,7 @@ def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutc
         if isinstance(event, Ask):
             return EventOutcome(flight, _TEMP, unavailable(event.mode))
         if event is CommanderEvent.MODE_DONE:
-            return EventOutcome(flight, Result.ACCEPTED, None)
+            return EventOutcome(flight, autopilot_state.Result.ACCEPTED, None)
     cell = TABLE[event].get(flight.phase, TransitionCell())
     after = replace(flight, phase=flight.phase if cell.phase is None else cell.phase)
     mode = flight.after_disarm if cell.restores_mode else cell.mode
@@ -207,16 +200,23 @@ def transition(flight: CommanderState, event: Ask | CommanderEvent) -> EventOutc
     return EventOutcome(after, cell.result, cell.text)
 
 
-def status_of(flight: CommanderState) -> CommanderStatus:
+def status_of(flight: CommanderState) -> autopilot_state.CommanderStatus:
     """Return the reported status of a state."""
-    arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
+    arming = (
+        autopilot_state.Arming.BOOT,
+        autopilot_state.Arming.STANDBY,
+        autopilot_state.Arming.ARMED,
+        autopilot_state.Arming.ARMED,
+    )[flight.phase]
     if flight.phase is not FlightPhase.AIR:
-        landed = Landed.ON_GROUND
+        landed = autopilot_state.Landed.ON_GROUND
     # Take-off is a separate landed state in MAVLink's extended state.
     elif flight.mode is Mode.TAKEOFF:
-        landed = Landed.TAKEOFF
+        landed = autopilot_state.Landed.TAKEOFF
     elif flight.mode is Mode.LAND:
-        landed = Landed.LANDING
+        landed = autopilot_state.Landed.LANDING
     else:
-        landed = Landed.IN_AIR
-    return CommanderStatus(arming, flight.mode, flight.intended, landed, flight.failsafe)
+        landed = autopilot_state.Landed.IN_AIR
+    return autopilot_state.CommanderStatus(
+        arming, flight.mode, flight.intended, landed, flight.failsafe
+    )

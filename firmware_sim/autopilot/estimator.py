@@ -13,27 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from airl_mav.core import frames
 from airl_mav.core.addons import entries, load
 from airl_mav.core.constants import TICK_S
-from airl_mav.core.frames import (
-    HOME,
-    MAGNETIC_DECLINATION,
-    Geodetic,
-    Vector,
-    geodetic_to_local,
-    local_to_geodetic,
-)
 from airl_mav.vehicle.atmosphere import altitude_m
+from firmware_sim.autopilot import error_state
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment, FieldCheck, add_record
 from firmware_sim.autopilot.autopilot_state import Clearance, StateEstimate
-from firmware_sim.autopilot.error_state import (
-    FusionHorizon,
-    KernelFilter,
-    Measurement,
-    NewFilter,
-    selecting,
-)
 from firmware_sim.autopilot.recovery import Recovery, RecoveryState
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.record import (
@@ -108,7 +95,7 @@ class Aiding:
     def height_moved(self, down_m: float) -> None:
         """Shift all heights with the origin of local NED, positive down [m]."""
 
-    def correct(self, baro: Measurement) -> None:
+    def correct(self, baro: error_state.Measurement) -> None:
         """Correct the offset of a barometer that was rejected, if another height is trusted."""
 
     def knows_motion(self, now_us: int, longest_us: float, *, flying: bool) -> bool:
@@ -144,7 +131,7 @@ class Estimator:
     def __init__(
         self,
         value: Callable[[str], float],
-        new_filter: NewFilter = KernelFilter,
+        new_filter: error_state.NewFilter = error_state.KernelFilter,
         record: Record | None = None,
     ) -> None:
         """Start unaligned, with a look-up for EKF2_* parameters and a factory of the filter.
@@ -155,23 +142,23 @@ class Estimator:
         """Record of the flight controller."""
         self.value = value
         """Look-up for EKF2_* parameters by name."""
-        self.origin: Geodetic | None = None
+        self.origin: frames.Geodetic | None = None
         """Geodetic origin of local NED: mean of the first fixes, or a client's choice; None while
         unknown."""
-        self.state: Vector = record["state"][0]
+        self.state: frames.Vector = record["state"][0]
         """Nominal state in the layout of `error_state`."""
         self.state[:] = es.new_state()
         self.filter = new_filter(np.diag(es.INITIAL_SIGMA**2), self._process_noise())
         """Filter for the error's covariance."""
-        if isinstance(self.filter, KernelFilter):
+        if isinstance(self.filter, error_state.KernelFilter):
             # Compiled ticks read the arrays of the record, so the filter works in place there.
             self.filter.keep_in(
                 record["covariance"][0], record["transition"][0], record["process_noise"][0]
             )
-        self.innovations: Callable[[str, Vector, Vector], None] | None = None
+        self.innovations: Callable[[str, frames.Vector, frames.Vector], None] | None = None
         """Callback with name, innovation and its covariance for every measurement."""
         self._alignment = Alignment(value, record)
-        self._chosen_origin: Geodetic | None = None
+        self._chosen_origin: frames.Geodetic | None = None
         """Origin of local NED chosen before alignment; None = the vehicle's position."""
         self.time_us = 0
         """Time of the newest sample [µs]."""
@@ -179,23 +166,25 @@ class Estimator:
         """Time of alignment with a GPS position; None: not aligned, or aligned without GPS."""
         self._estimate: StateEstimate | None = None
         # GPS is fused in two parts, so a bad height does not reject a good horizontal fix.
-        horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
+        horizontal = error_state.selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         record["gps_horizontal_h"] = horizontal
-        record["gps_vertical_h"] = selecting(es.POS + 2, es.VEL + 2)
-        self._gps_horizontal = Measurement(
+        record["gps_vertical_h"] = error_state.selecting(es.POS + 2, es.VEL + 2)
+        self._gps_horizontal = error_state.Measurement(
             "gps_horizontal", 0, record["gps_horizontal_h"][0], record["gps_horizontal_us"]
         )
-        self.gps_vertical = Measurement(
+        self.gps_vertical = error_state.Measurement(
             "gps_vertical", 3, record["gps_vertical_h"][0], record["gps_vertical_us"]
         )
-        self._gps_sinking = Measurement("gps_down_velocity", 3, selecting(es.VEL + 2))
+        self._gps_sinking = error_state.Measurement(
+            "gps_down_velocity", 3, error_state.selecting(es.VEL + 2)
+        )
         # A barometer measures -z plus its own offset.
-        record["baro_h"] = selecting(es.BARO) - selecting(es.POS + 2)
-        self.baro = Measurement("baro", 1, record["baro_h"][0], record["baro_fused_us"])
+        record["baro_h"] = error_state.selecting(es.BARO) - error_state.selecting(es.POS + 2)
+        self.baro = error_state.Measurement("baro", 1, record["baro_h"][0], record["baro_fused_us"])
         # `observe_heading` writes this Jacobian for every sample: it depends on the attitude.
         heading_h, heading_us = record["heading_h"][0], record["heading_fused_us"]
-        self._heading = Measurement("heading", 2, heading_h, heading_us)
-        self._horizon = FusionHorizon()
+        self._heading = error_state.Measurement("heading", 2, heading_h, heading_us)
+        self._horizon = error_state.FusionHorizon()
         self.yaw = YawEstimator(record)
         """Heading estimate without a compass."""
         self.recovery = Recovery(self.state, self.filter, self.yaw, record)
@@ -254,7 +243,7 @@ class Estimator:
         if sample.pressure_hpa is not None:
             record["pressure_hpa"] = sample.pressure_hpa
         if sample.gps is not None:
-            record["gps_position"] = geodetic_to_local(sample.gps.position, HOME)
+            record["gps_position"] = frames.geodetic_to_local(sample.gps.position, frames.HOME)
             record["gps_velocity"] = sample.gps.velocity_ned
 
     def _fuse_slower(self, sample: SensorSample) -> None:
@@ -280,7 +269,7 @@ class Estimator:
             self.aiding.is_idle
             and self.innovations is None
             and not self._horizon.is_past
-            and isinstance(self.filter, KernelFilter)
+            and isinstance(self.filter, error_state.KernelFilter)
         )
 
     def prepare(self) -> None:
@@ -350,7 +339,7 @@ class Estimator:
             )
         return self._estimate
 
-    def move_origin(self, origin: Geodetic) -> None:
+    def move_origin(self, origin: frames.Geodetic) -> None:
         """Move the origin of local NED; the vehicle's geodetic position is unchanged.
 
         Source: PX4 1.16, Ekf::setEkfGlobalOrigin.
@@ -362,8 +351,8 @@ class Estimator:
                 self.origin, self._estimate = origin, None
             return
         # The vehicle stays at its geodetic position, so its local position changes.
-        here = local_to_geodetic(self.state[es.P : es.V], before)
-        self.state[es.P : es.V] = geodetic_to_local(here, origin)
+        here = frames.local_to_geodetic(self.state[es.P : es.V], before)
+        self.state[es.P : es.V] = frames.geodetic_to_local(here, origin)
         # Terrain and barometer refer to the origin's altitude and shift with it.
         self.aiding.height_moved(origin.altitude_m - before.altitude_m)
         self._origin_altitude_baro += origin.altitude_m - before.altitude_m
@@ -418,7 +407,7 @@ class Estimator:
         v_north, v_east = self.state[es.SIGMA + 3 : es.SIGMA + 5].tolist()
         return math.hypot(north, east), math.hypot(v_north, v_east)
 
-    def _recent(self, m: Measurement, now_us: int, longest_us: float) -> bool:
+    def _recent(self, m: error_state.Measurement, now_us: int, longest_us: float) -> bool:
         """Return whether a measurement was fused recently; a GPS alignment counts for all."""
         fused_us = m.fused_us
         since = self._fixed_us if fused_us is None else fused_us
@@ -448,7 +437,7 @@ class Estimator:
         """True if GPS fusion is enabled by EKF2_GPS_CTRL."""
         return self.value("EKF2_GPS_CTRL") != 0
 
-    def _process_noise(self) -> Vector:
+    def _process_noise(self) -> frames.Vector:
         value = self.value
         q = np.zeros(es.N_STATES)
         # As in PX4, the variance grows by (noise dt)² per step.
@@ -472,7 +461,7 @@ class Estimator:
 
     # --- measurements
 
-    def fuse(self, m: Measurement) -> bool:
+    def fuse(self, m: error_state.Measurement) -> bool:
         """Fuse a measurement if it is within the gate; return whether it was."""
         if self.innovations is not None:
             # Consistency tests need the innovation before the fusion changes the state.
@@ -489,8 +478,8 @@ class Estimator:
     def _fuse_gps(self, fix: GpsFix) -> None:
         if self.origin is None:
             # Vision has defined the local position; the first fix gives its geodetic origin.
-            self.origin = local_to_geodetic(-self.state[es.P : es.V], fix.position)
-        measured, value = geodetic_to_local(fix.position, self.origin), self.value
+            self.origin = frames.local_to_geodetic(-self.state[es.P : es.V], fix.position)
+        measured, value = frames.geodetic_to_local(fix.position, self.origin), self.value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
         self._horizon.assume(value("EKF2_GPS_DELAY"))
         self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
@@ -522,7 +511,7 @@ class Estimator:
         elif not self.aiding.gives_height:
             self.fuse(m)
 
-    def _observe_yaw(self, velocity: Vector, accuracy: float) -> None:
+    def _observe_yaw(self, velocity: frames.Vector, accuracy: float) -> None:
         state = self.state
         if self._horizon.is_past:
             # The yaw estimator runs in the present: shift a delayed velocity to now.
@@ -530,7 +519,7 @@ class Estimator:
         bias = state[es.GYRO_BIAS : es.ACCEL_BIAS]
         self.yaw.observe(velocity, accuracy, bias, flying=self.flying)
 
-    def _then(self) -> Vector:
+    def _then(self) -> frames.Vector:
         """Return position and velocity (6,) NED at the measurement time of the current fix."""
         state, horizon = self.state, self._horizon
         return horizon.seen_from(state) if horizon.is_past else state[es.P : es.Q]
@@ -544,12 +533,12 @@ class Estimator:
         if not self.fuse(self.baro):
             self.aiding.correct(self.baro)
 
-    def _fuse_heading(self, field: Vector) -> None:
+    def _fuse_heading(self, field: frames.Vector) -> None:
         if self.aiding.gives_heading or self.value("EKF2_MAG_TYPE") == _NO_COMPASS:
             return
         m = self._heading
         observable = es.observe_heading(
-            self.state, field, MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, m.innovation, m.h
+            self.state, field, frames.MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, m.innovation, m.h
         )
         innovation = m.innovation.item(0)
         if not (observable and self.recovery.compass.admits(innovation)):

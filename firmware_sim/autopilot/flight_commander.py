@@ -8,15 +8,8 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
+from firmware_sim.autopilot import commander
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
-from firmware_sim.autopilot.commander import (
-    Ask,
-    CommanderEvent,
-    CommanderState,
-    FlightPhase,
-    status_of,
-    transition,
-)
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_modes import Mode
@@ -25,7 +18,7 @@ from firmware_sim.autopilot.inputs import ModeRequest
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 
-_GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
+_GROUND, _AIR = commander.FlightPhase.GROUND, commander.FlightPhase.AIR
 _TERMINATION = Mode.TERMINATION
 
 
@@ -45,7 +38,9 @@ class AutoDisarm:
         """Start a flight: earlier time on the ground does not count."""
         self._standing_since_us = None
 
-    def event(self, flight: CommanderState, time_us: int, *, idle: bool) -> CommanderEvent | None:
+    def event(
+        self, flight: commander.CommanderState, time_us: int, *, idle: bool
+    ) -> commander.CommanderEvent | None:
         """Return the event of an expired timeout, or None.
 
         `idle`: the motors are stopped. Spool-up and take-off ramp do not count as ground time.
@@ -57,7 +52,7 @@ class AutoDisarm:
                 self._stopped_since_us = time_us
             due_us = self._stopped_since_us + self._value("COM_KILL_DISARM") * US_PER_S
             if time_us >= due_us:
-                return CommanderEvent.LOCKDOWN_TIMEOUT
+                return commander.CommanderEvent.LOCKDOWN_TIMEOUT
             self.due_us = due_us
             return None
         self._stopped_since_us = None
@@ -73,7 +68,11 @@ class AutoDisarm:
         due_us = self._standing_since_us + limit_s * US_PER_S
         self.due_us = due_us if limit_s > 0.0 and time_us < due_us else math.inf
         if limit_s > 0.0 and time_us >= due_us:
-            return CommanderEvent.LANDED_TIMEOUT if self._flown else CommanderEvent.DISARM_TIMEOUT
+            return (
+                commander.CommanderEvent.LANDED_TIMEOUT
+                if self._flown
+                else commander.CommanderEvent.DISARM_TIMEOUT
+            )
         return None
 
 
@@ -110,8 +109,8 @@ class FlightCommander:
             say: Sends a text to the operator.
         """
         self._commanded, self._newest, self._state, self._say = commanded, newest, state, say
-        self.flight = CommanderState()
-        self.status = status_of(self.flight)
+        self.flight = commander.CommanderState()
+        self.status = commander.status_of(self.flight)
         """Reported status of `flight`, replaced with every change."""
         self.refusal = ("", 0)
         """Reason and time [µs] of the last rejected offboard setpoint."""
@@ -131,7 +130,7 @@ class FlightCommander:
 
     def handle(
         self,
-        event: Ask | CommanderEvent,
+        event: commander.Ask | commander.CommanderEvent,
         request: ModeRequest | None = None,
         granted: OperatorText | None = None,
     ) -> Result:
@@ -142,13 +141,13 @@ class FlightCommander:
             request: Optional arguments of a mode.
             granted: Text to send upon acceptance.
         """
-        step = transition(self.flight, event)
+        step = commander.transition(self.flight, event)
         # A text of the table takes precedence over the command's.
         text = granted if step.text is None and step.result is Result.ACCEPTED else step.text
         if text is not None:
             self._say(text)
         flown = self.flight.mode
-        requested = isinstance(event, Ask) and step.result is Result.ACCEPTED
+        requested = isinstance(event, commander.Ask) and step.result is Result.ACCEPTED
         if requested and step.flight.phase >= _GROUND:
             # A failsafe may persist, or yield to the user.
             self._become(step.flight, step.flight.mode)
@@ -158,11 +157,11 @@ class FlightCommander:
         return step.result
 
     def _become(
-        self, flight: CommanderState, flown: Mode, request: ModeRequest | None = None
+        self, flight: commander.CommanderState, flown: Mode, request: ModeRequest | None = None
     ) -> None:
         """Set a new state; `flown` is the mode in guidance, `request` the user's."""
         before = self.flight
-        self.flight, self.status = flight, status_of(flight)
+        self.flight, self.status = flight, commander.status_of(flight)
         if flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
             self._explain_loss()
         if self._newest.sample is None:
@@ -201,9 +200,9 @@ class FlightCommander:
         if flight != self.flight or flight.mode is not flown or request is not None:
             self._become(flight, flown, request)
         if decision.disarm:
-            self.handle(CommanderEvent.FAILSAFE_DISARM)
+            self.handle(commander.CommanderEvent.FAILSAFE_DISARM)
 
-    def _note_times(self, phase: FlightPhase) -> None:
+    def _note_times(self, phase: commander.FlightPhase) -> None:
         """Record the times of arming and take-off; reset both when disarmed."""
         now_us = self._now_us
         if phase < _GROUND:

@@ -9,10 +9,7 @@ from typing import Protocol
 
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
-from firmware_sim.autopilot.autopilot_state import (
-    OperatorText,
-    Severity,
-)
+from firmware_sim.autopilot import autopilot_state
 
 _INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
 FLOAT32_RELATIVE = 1e-6
@@ -60,7 +57,7 @@ class Parameters:
         self._listeners: list[Callable[[], None]] = []
         self._bounded: set[str] = {name for name in overrides or () if self._is_bounded(name)}
         """Parameters whose value is clipped for flight, and reported as such."""
-        self._texts: list[OperatorText] = [
+        self._texts: list[autopilot_state.OperatorText] = [
             self._bounded_text(name) for name in sorted(self._bounded)
         ]
         self._keeper = keeper
@@ -74,7 +71,7 @@ class Parameters:
         self._listeners.append(listener)
         return lambda: self._listeners.remove(listener)
 
-    def take_texts(self) -> list[OperatorText]:
+    def take_texts(self) -> list[autopilot_state.OperatorText]:
         """Return new texts about clipped values since the last call.
 
         Each is reported once, and again only after an unclipped value.
@@ -179,9 +176,11 @@ class Parameters:
             self._flown[name], stored, rel_tol=FLOAT32_RELATIVE
         )
 
-    def _bounded_text(self, name: str) -> OperatorText:
+    def _bounded_text(self, name: str) -> autopilot_state.OperatorText:
         value, flown = self._values[_INDEX[name]], self._flown[name]
-        return OperatorText(Severity.WARNING, f"{name} {value:g} is flown as {flown:g}")
+        return autopilot_state.OperatorText(
+            autopilot_state.Severity.WARNING, f"{name} {value:g} is flown as {flown:g}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

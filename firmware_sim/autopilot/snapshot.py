@@ -9,17 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Geodetic, Vector
-from firmware_sim.autopilot.autopilot_state import (
-    NO_MISSION,
-    Clearance,
-    CommanderStatus,
-    FenceStatus,
-    Health,
-    MissionProgress,
-    OrbitStatus,
-    Setpoint,
-    StateEstimate,
-)
+from firmware_sim.autopilot import autopilot_state
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import Sticks
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans
@@ -31,17 +21,17 @@ if TYPE_CHECKING:
     from firmware_sim.engine.controller import ControlSetpoints
 
 
-def progress(plans: Plans) -> MissionProgress:
+def progress(plans: Plans) -> autopilot_state.MissionProgress:
     """Return the mission progress and the ids of the stored lists."""
     mission, fence, rally = (plans.stored(kind) for kind in MissionType)
     if not (mission.items or fence.items or rally.items):
-        return NO_MISSION
-    return MissionProgress(
+        return autopilot_state.NO_MISSION
+    return autopilot_state.MissionProgress(
         plans.current, len(mission.items), mission.identity, fence.identity, rally.identity
     )
 
 
-def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
+def setpoint_of(tick: Any, velocity: Vector) -> autopilot_state.Setpoint:
     """Return the controller's setpoint in a tick of its record or log (`engine.record`).
 
     `velocity` is the setpoint of the velocity loop (3,) NED [m/s].
@@ -49,10 +39,12 @@ def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
     kind, demand = tick["demand_kind"], tick["demand"].copy()
     # Other kinds have no position setpoint: log the present position instead.
     if kind not in (POSITION, TRAJECTORY):
-        return Setpoint(tick["state"][:3].copy(), velocity, math.nan, 0.0)
+        return autopilot_state.Setpoint(tick["state"][:3].copy(), velocity, math.nan, 0.0)
     # The two layouts of `demand` hold yaw and yaw rate at different places.
     yaw = 6 if kind == POSITION else 9
-    return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
+    return autopilot_state.Setpoint(
+        demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1])
+    )
 
 
 class AutopilotState:
@@ -67,11 +59,11 @@ class AutopilotState:
     """Simulated time of the tick [µs]."""
     revision: object
     """Same object while log data outside the tick's log is unchanged; None = unknown."""
-    estimate: StateEstimate
+    estimate: autopilot_state.StateEstimate
     """The estimator's output."""
-    status: CommanderStatus
+    status: autopilot_state.CommanderStatus
     """State of the commander."""
-    setpoint: Setpoint
+    setpoint: autopilot_state.Setpoint
     """Setpoint of the position controller, in every mode."""
     attitude_setpoint: Vector
     """(4,) body -> NED."""
@@ -105,13 +97,13 @@ class AutopilotState:
     """Time of arming [µs], 0 while disarmed."""
     takeoff_us: int
     """Time of take-off [µs], 0 before."""
-    mission: MissionProgress
+    mission: autopilot_state.MissionProgress
     """Progress of the mission."""
-    fence: FenceStatus
+    fence: autopilot_state.FenceStatus
     """Violated limits of the geofence."""
-    orbit: OrbitStatus | None
+    orbit: autopilot_state.OrbitStatus | None
     """Active circle in Orbit mode."""
-    health: Health
+    health: autopilot_state.Health
     """Usability of sensors and estimates."""
     hover_thrust: float
     """Collective thrust in hover, 0..1."""
@@ -125,13 +117,13 @@ class AutopilotState:
     """Motor outputs reported by the speed controllers; None: outputs equal commands."""
     readings: Mapping[str, Received]
     """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
-    clearance: Clearance | None
+    clearance: autopilot_state.Clearance | None
     """Height above the ground; None before the first range."""
 
     def __init__(
         self,
         autopilot: BuiltinAutopilot,
-        status: CommanderStatus,
+        status: autopilot_state.CommanderStatus,
         time_us: int,
         demand: AnyDemand | None,
         revision: object,
@@ -141,7 +133,7 @@ class AutopilotState:
         self._autopilot, self._demand = autopilot, demand
         self.status, self.time_us, self.revision = status, time_us, revision
         self._loops: ControlSetpoints | None = None
-        self._health: Health | None = None
+        self._health: autopilot_state.Health | None = None
 
     @property
     def _setpoints(self) -> ControlSetpoints:
@@ -149,12 +141,12 @@ class AutopilotState:
             self._loops = self._autopilot._controller.setpoints()
         return self._loops
 
-    def _checked(self) -> Health:
+    def _checked(self) -> autopilot_state.Health:
         if self._health is None:
             self._health = self._autopilot.supervisor.health(self.time_us)
         return self._health
 
-    def _circle(self) -> OrbitStatus | None:
+    def _circle(self) -> autopilot_state.OrbitStatus | None:
         autopilot = self._autopilot
         return autopilot._guidance.context.orbit if autopilot.flight.mode is Mode.ORBIT else None
 

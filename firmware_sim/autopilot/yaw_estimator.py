@@ -24,16 +24,7 @@ import numpy as np
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel
-from airl_mav.vehicle.rotation import (
-    Quat,
-    Vec,
-    conjugate,
-    exponential,
-    multiply,
-    normalize,
-    rotate,
-    yaw_of,
-)
+from airl_mav.vehicle import rotation
 from firmware_sim.autopilot.error_state import GYRO_BIAS as _GYRO_BIAS
 
 WINDOW = 20
@@ -118,28 +109,28 @@ def _accel_gain(force_norm: float) -> float:
 
 
 @kernel
-def _quat(m: Vector) -> Quat:
+def _quat(m: Vector) -> rotation.Quat:
     return m[ATTITUDE], m[ATTITUDE + 1], m[ATTITUDE + 2], m[ATTITUDE + 3]
 
 
 @kernel
-def _put(m: Vector, q: Quat) -> None:
-    m[ATTITUDE], m[ATTITUDE + 1], m[ATTITUDE + 2], m[ATTITUDE + 3] = normalize(q)
+def _put(m: Vector, q: rotation.Quat) -> None:
+    m[ATTITUDE], m[ATTITUDE + 1], m[ATTITUDE + 2], m[ATTITUDE + 3] = rotation.normalize(q)
 
 
 @kernel
 def _turn(m: Vector, angle: float) -> None:
     """Rotate a model's attitude about the world's down axis."""
-    _put(m, multiply((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)), _quat(m)))
+    _put(m, rotation.multiply((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)), _quat(m)))
 
 
 @kernel
-def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
+def _level(m: Vector, gyro: rotation.Vec, force: rotation.Vec, dt: float) -> None:
     """Advance a model's attitude by the gyro; correct its tilt to the smoothed specific force."""
     norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
     gain = _accel_gain(norm)
     # Cross product of the expected down axis and the measured force: it levels the model.
-    down = rotate(conjugate(_quat(m)), (0.0, 0.0, 1.0))
+    down = rotation.rotate(rotation.conjugate(_quat(m)), (0.0, 0.0, 1.0))
     share = gain / norm if gain > 0.0 else 0.0
     tilt = (
         share * (down[1] * force[2] - down[2] * force[1]),
@@ -154,24 +145,24 @@ def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
         for i in range(3):
             bias = m[BIAS + i] - tilt[i] * GYRO_BIAS_GAIN * dt
             m[BIAS + i] = min(max(bias, -BIAS_LIMIT), BIAS_LIMIT)
-    turn = exponential(
+    turn = rotation.exponential(
         (
             (gyro[0] + tilt[0] - m[BIAS]) * dt,
             (gyro[1] + tilt[1] - m[BIAS + 1]) * dt,
             (gyro[2] + tilt[2] - m[BIAS + 2]) * dt,
         )
     )
-    _put(m, multiply(_quat(m), turn))
+    _put(m, rotation.multiply(_quat(m), turn))
 
 
 @kernel
-def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
+def _predict(m: Vector, accel: rotation.Vec, dt: float) -> tuple[float, float]:
     """Advance a model's velocity, and its covariance with the heading, P = F P F' + Q.
 
     Only the heading column of F differs from the identity: a heading error rotates the velocity
     change, which is returned (north, east).
     """
-    north, east, _ = rotate(_quat(m), (accel[0] * dt, accel[1] * dt, accel[2] * dt))
+    north, east, _ = rotation.rotate(_quat(m), (accel[0] * dt, accel[1] * dt, accel[2] * dt))
     # A heading error of 1 rad turns the change (n, e) to (-e, n).
     by_n, by_e = -east, north
     # First covariance with the heading, since the velocity block uses old and new values.
@@ -219,7 +210,9 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
                 continue
             roll = math.atan2(-a[1], -a[2])
             pitch = math.atan2(a[0], math.sqrt(a[1] * a[1] + a[2] * a[2]))
-            level = multiply(exponential((0.0, pitch, 0.0)), exponential((roll, 0.0, 0.0)))
+            level = rotation.multiply(
+                rotation.exponential((0.0, pitch, 0.0)), rotation.exponential((roll, 0.0, 0.0))
+            )
             for j in range(N_MODELS):
                 _put(models[j], level)
             shared[ALIGNED] = 1.0
@@ -234,7 +227,7 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
     # YAW follows the attitude, once per block: no sample in between reads it.
     if len(gyro) > 0 and shared[STARTED] != 0.0:
         for j in range(N_MODELS):
-            models[j, YAW] = yaw_of(_quat(models[j]))
+            models[j, YAW] = rotation.yaw_of(_quat(models[j]))
 
 
 @kernel
@@ -245,7 +238,7 @@ def _start(models: Vector, shared: Vector, north: float, east: float, variance: 
         m = models[j]
         # The middle of each of the equal sectors.
         yaw = -math.pi + (j + 0.5) * step
-        _turn(m, yaw - yaw_of(_quat(m)))
+        _turn(m, yaw - rotation.yaw_of(_quat(m)))
         m[:ATTITUDE] = 0.0
         m[X], m[X + 1], m[YAW] = north, east, yaw
         m[P_NN] = m[P_EE] = variance

@@ -13,26 +13,11 @@ import math
 
 import numpy as np
 
-from airl_mav.control.cascade import (
-    Filters,
-    Output,
-    attitude_tick,
-    cascade_tick,
-    rate_tick,
-    trajectory_tick,
-)
+from airl_mav.control import cascade
 from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
 from airl_mav.control.memory import Biquad
+from airl_mav.core import frames
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, US_PER_S
-from airl_mav.core.frames import (
-    HOME,
-    MAGNETIC_DECLINATION,
-    MAGNETIC_FIELD_NED,
-    Geodetic,
-    Vector,
-    geodetic_to_local,
-    local_to_geodetic,
-)
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.airframe import accelerate, airframe_of, drift
@@ -44,39 +29,7 @@ from firmware_sim.autopilot.error_state import fuse, predict, spread
 from firmware_sim.autopilot.land_detector import lifts_off, rests
 from firmware_sim.autopilot.recovery import FAR, REFUSED_US, note_velocity
 from firmware_sim.autopilot.yaw_estimator import feel, observe
-from firmware_sim.engine.dynamics import (
-    WIDTH,
-    Speeds,
-    absorb,
-    actuate,
-    force,
-    quaternion,
-    rates,
-    velocity,
-    write,
-)
-from firmware_sim.engine.record import (
-    ATTITUDE,
-    BARO_ROW,
-    CHANGED,
-    FIRST,
-    GPS,
-    GPS_ROW,
-    IDLE,
-    LANDING,
-    LIFT_OFF,
-    MAG,
-    MAG_ROW,
-    OFF,
-    POSITION,
-    PRESSURE,
-    SEEN,
-    SUSPECT,
-    TRAJECTORY,
-    TRUSTED,
-    Fields,
-    Record,
-)
+from firmware_sim.engine import dynamics, record
 
 NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN, EMPTY, CLIMBED = range(10)
 """Events returned by `stretch`: all ticks are flown; a noise block is used up; a contact is
@@ -111,7 +64,7 @@ PA_PER_HPA = 100.0
 _INERTIAL, _COMPASS, _BAROMETER, _GPS, _WIND = range(5)
 """Indices in `noise_at`."""
 
-_NORTH, _EAST, _DOWN = MAGNETIC_FIELD_NED
+_NORTH, _EAST, _DOWN = frames.MAGNETIC_FIELD_NED
 HEADING_BY_TURN_NED = np.array([-_DOWN * _NORTH, -_DOWN * _EAST, _NORTH**2 + _EAST**2]) / (
     _NORTH**2 + _EAST**2
 )
@@ -119,7 +72,7 @@ HEADING_BY_TURN_NED = np.array([-_DOWN * _NORTH, -_DOWN * _EAST, _NORTH**2 + _EA
 measured heading: d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination),
 1)."""
 
-_HOME_M = HOME.altitude_m
+_HOME_M = frames.HOME.altitude_m
 _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
 """Offsets of the setpoints in `output`."""
 
@@ -128,7 +81,7 @@ _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
 
 
 @kernel
-def _store(out: Output, c: Fields) -> None:
+def _store(out: cascade.Output, c: record.Fields) -> None:
     for i in range(4):
         c.output[_ATTITUDE + i] = out.attitude[i]
         c.motors[i] = out.motors[i]
@@ -139,53 +92,53 @@ def _store(out: Output, c: Fields) -> None:
 
 
 @large_kernel
-def control(c: Fields) -> None:
+def control(c: record.Fields) -> None:
     """Compute motor commands from estimate and demand: one tick of the cascade.
 
     Updates `output`, `motors` and `memory` of a flight controller.
     """
     kind, s, d = c.demand_kind, c.state, c.demand
     # Stopped motors: the loops do not run, and integrators stay at rest.
-    if kind == IDLE:
+    if kind == record.IDLE:
         for i in range(4):
             c.motors[i] = 0.0
         return
     gains, f = c.gains, c.filters
     # Unpack the record once: the control loops take tuples.
-    weights = Filters(f[0], Biquad(f[1], f[2], f[3], f[4], f[5]), f[6], f[7])
+    weights = cascade.Filters(f[0], Biquad(f[1], f[2], f[3], f[4], f[5]), f[6], f[7])
     p, v = (s[0], s[1], s[2]), (s[3], s[4], s[5])
     q, w = (s[6], s[7], s[8], s[9]), (s[10], s[11], s[12])
-    if kind == POSITION:
+    if kind == record.POSITION:
         demand = Demand((d[0], d[1], d[2]), (d[3], d[4], d[5]), d[6], d[7])
-        _store(cascade_tick(p, v, q, w, demand, c.memory, gains, weights, TICK_S), c)
-    elif kind == TRAJECTORY:
+        _store(cascade.cascade_tick(p, v, q, w, demand, c.memory, gains, weights, TICK_S), c)
+    elif kind == record.TRAJECTORY:
         path = TrajectoryDemand(
             (d[0], d[1], d[2]), (d[3], d[4], d[5]), (d[6], d[7], d[8]), d[9], d[10]
         )
-        _store(trajectory_tick(p, v, q, w, path, c.memory, gains, weights, TICK_S), c)
-    elif kind == ATTITUDE:
+        _store(cascade.trajectory_tick(p, v, q, w, path, c.memory, gains, weights, TICK_S), c)
+    elif kind == record.ATTITUDE:
         attitude = AttitudeDemand((d[0], d[1], d[2], d[3]), d[4], d[5])
-        _store(attitude_tick(v, q, w, attitude, c.memory, gains, weights, TICK_S), c)
+        _store(cascade.attitude_tick(v, q, w, attitude, c.memory, gains, weights, TICK_S), c)
     else:
         turn = RateDemand((d[0], d[1], d[2]), d[3])
-        _store(rate_tick(v, q, w, turn, c.memory, gains, weights, TICK_S), c)
+        _store(cascade.rate_tick(v, q, w, turn, c.memory, gains, weights, TICK_S), c)
 
 
 @kernel
-def control_record(controller: Record) -> None:
+def control_record(controller: record.Record) -> None:
     """Compute motor commands from estimate and demand of a record (1,)."""
     control(controller[0])
 
 
 @kernel
-def _detect(c: Fields) -> bool:
+def _detect(c: record.Fields) -> bool:
     """Return True if the vehicle has just lifted off, or has come to rest on the ground."""
     thrust, down_m_s = c.output[_THRUST], c.output[_VELOCITY + 2]
-    if c.detecting == LIFT_OFF:
+    if c.detecting == record.LIFT_OFF:
         # A new flight starts without time at rest.
         c.still_since_us = -1
         return lifts_off(c.state, thrust, c.land)
-    if c.detecting != LANDING:
+    if c.detecting != record.LANDING:
         return False
     # Time at rest counts only while the setpoint descends.
     if down_m_s <= 0.0 or not rests(c.state, thrust, c.land):
@@ -197,13 +150,13 @@ def _detect(c: Fields) -> bool:
 
 
 @kernel
-def detect_record(controller: Record) -> bool:
+def detect_record(controller: record.Record) -> bool:
     """Return True if the vehicle of a record (1,) has just lifted off, or come to rest."""
     return _detect(controller[0])
 
 
 @kernel
-def command(c: Fields, flown: Fields) -> None:
+def command(c: record.Fields, flown: record.Fields) -> None:
     """Compute and log the motor commands of a tick, and update the land detector.
 
     Writes a row of the log (`record.FLOWN_TICK`), except for the aircraft's battery.
@@ -215,7 +168,7 @@ def command(c: Fields, flown: Fields) -> None:
 
 
 @kernel
-def log_flown(c: Fields, flown: Fields) -> None:
+def log_flown(c: record.Fields, flown: record.Fields) -> None:
     """Log a flight controller in a tick (`record.FLOWN_TICK`), except for the battery."""
     flown.time_us, flown.healthy = c.time_us, c.healthy
     for i in range(es.ROW_SIZE):
@@ -235,10 +188,10 @@ def log_flown(c: Fields, flown: Fields) -> None:
 
 
 @kernel
-def push(a: Fields, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
+def push(a: record.Fields, motors: dynamics.Speeds, wind: frames.Vector) -> tuple[Vec, Vec, Vec]:
     """Advance the rotors by a tick; return centre of mass, force and torque as `actuate`."""
     s = a.speeds
-    speeds, here, pushed, torque = actuate(
+    speeds, here, pushed, torque = dynamics.actuate(
         (s[0], s[1], s[2], s[3]), motors, a.motion, wind, a.airframe, a.rotor_lag
     )
     for i in range(4):
@@ -258,10 +211,10 @@ def push(a: Fields, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
 
 
 @kernel
-def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
+def finish(a: record.Fields, after: frames.Vector, wind: frames.Vector, standing: bool) -> None:
     """Apply the motion after a tick (16,): advance time and drain the battery."""
     f, s = a.acceleration, a.speeds
-    a.power_w, felt, reading, a.charge = absorb(
+    a.power_w, felt, reading, a.charge = dynamics.absorb(
         a.motion,
         after,
         wind,
@@ -279,7 +232,7 @@ def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
         a.acceleration[i] = felt[i]
     for i in range(4):
         a.battery[i] = reading[i]
-    for i in range(WIDTH):
+    for i in range(dynamics.WIDTH):
         # Copy last: `absorb` compares the motion before and after.
         a.motion[i] = after[i]
     a.ticks += 1
@@ -288,7 +241,7 @@ def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
 
 
 @kernel
-def _turning(a: Fields, c: Fields) -> Speeds:
+def _turning(a: record.Fields, c: record.Fields) -> dynamics.Speeds:
     """Return the motor commands; zero with an empty battery."""
     if a.charge <= 0.0:
         return 0.0, 0.0, 0.0, 0.0
@@ -296,9 +249,9 @@ def _turning(a: Fields, c: Fields) -> Speeds:
 
 
 @kernel
-def _nearing_m(a: Fields) -> float:
+def _nearing_m(a: record.Fields) -> float:
     """Return the maximum approach of any part to any object in a tick [m]."""
-    v, w = velocity(a.motion), rates(a.motion)
+    v, w = dynamics.velocity(a.motion), dynamics.rates(a.motion)
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     spin = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     # Speed of the vehicle, of moving objects, and of its outermost part by rotation.
@@ -307,71 +260,81 @@ def _nearing_m(a: Fields) -> float:
 
 
 @kernel
-def _is_clear(a: Fields) -> bool:
+def _is_clear(a: record.Fields) -> bool:
     """Return True if contacts are impossible in the coming tick."""
     return bool(a.room_m > a.clear_m + _nearing_m(a))
 
 
 @kernel
-def is_clear_record(aircraft: Record) -> bool:
+def is_clear_record(aircraft: record.Record) -> bool:
     """Return True if contacts are impossible in the coming tick of a record (1,)."""
     return _is_clear(aircraft[0])
 
 
 @kernel
-def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
+def _glide(a: record.Fields, c: record.Fields, wind: frames.Vector, after: frames.Vector) -> None:
     """Move an aircraft without contact by one tick; `after` (16,) is scratch."""
     before, dt = a.motion, a.tick_s
     here, thrust, torque = push(a, _turning(a, c), wind)
-    q, airframe = quaternion(before), airframe_of(a.airframe)
+    q, airframe = dynamics.quaternion(before), airframe_of(a.airframe)
     # Torque in body axes, where the inertia is constant.
     turn = rotate(conjugate(q), torque)
-    v, spin = accelerate(velocity(before), q, rates(before), thrust, turn, airframe, dt)
+    v, spin = accelerate(
+        dynamics.velocity(before), q, dynamics.rates(before), thrust, turn, airframe, dt
+    )
     p, q_new, omega = drift(here, v, q, spin, dt)
     # Keep w >= 0, as the estimate does.
     if q_new[0] < 0.0:
         q_new = (-q_new[0], -q_new[1], -q_new[2], -q_new[3])
-    write(p, v, q_new, omega, before, dt, after)
+    dynamics.write(p, v, q_new, omega, before, dt, after)
     finish(a, after, wind, False)
     # Contact room shrinks by the largest possible approach; Python measures it again at zero.
     a.room_m -= _nearing_m(a)
 
 
 @kernel
-def log(a: Fields, truth: Fields) -> None:
+def log(a: record.Fields, truth: record.Fields) -> None:
     """Log the aircraft after a tick (`record.TRUE_TICK`)."""
     truth.time_us, truth.power_w, truth.charge = a.time_us, a.power_w, a.charge
-    for i in range(WIDTH):
+    for i in range(dynamics.WIDTH):
         truth.motion[i] = a.motion[i]
 
 
 @kernel
-def _rest(a: Fields, motors: Speeds, wind: Vector, after: Vector) -> None:
+def _rest(
+    a: record.Fields, motors: dynamics.Speeds, wind: frames.Vector, after: frames.Vector
+) -> None:
     """Keep an aircraft at rest for one tick; `after` (16,) is scratch."""
     push(a, motors, wind)
     row = a.motion
-    for i in range(WIDTH):
+    for i in range(dynamics.WIDTH):
         after[i] = row[i]
     # At rest the accelerometer measures the floor's push: -g in body axes.
-    after[13], after[14], after[15] = rotate(conjugate(quaternion(row)), (0.0, 0.0, -GRAVITY_M_S2))
+    after[13], after[14], after[15] = rotate(
+        conjugate(dynamics.quaternion(row)), (0.0, 0.0, -GRAVITY_M_S2)
+    )
     finish(a, after, wind, True)
     a.room_m -= _nearing_m(a)
 
 
 @kernel
-def rest_record(aircraft: Record, motors: Speeds, wind: Vector) -> None:
+def rest_record(aircraft: record.Record, motors: dynamics.Speeds, wind: frames.Vector) -> None:
     """Keep the aircraft of a record (1,) at rest for one tick."""
-    _rest(aircraft[0], motors, wind, np.empty(WIDTH))
+    _rest(aircraft[0], motors, wind, np.empty(dynamics.WIDTH))
 
 
 @kernel
-def push_record(aircraft: Record, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
+def push_record(
+    aircraft: record.Record, motors: dynamics.Speeds, wind: frames.Vector
+) -> tuple[Vec, Vec, Vec]:
     """Advance the rotors of a record (1,) by a tick; return the results of `actuate`."""
     return push(aircraft[0], motors, wind)
 
 
 @kernel
-def finish_record(aircraft: Record, after: Vector, wind: Vector, standing: bool) -> None:
+def finish_record(
+    aircraft: record.Record, after: frames.Vector, wind: frames.Vector, standing: bool
+) -> None:
     """Apply the motion after a tick (16,) to a record (1,); see `finish`."""
     finish(aircraft[0], after, wind, standing)
 
@@ -380,7 +343,7 @@ def finish_record(aircraft: Record, after: Vector, wind: Vector, standing: bool)
 
 
 @kernel
-def is_due(schedule: Vector, time_us: int) -> bool:
+def is_due(schedule: frames.Vector, time_us: int) -> bool:
     """Return True once per period of a sensor, given (rate [Hz], next sample [µs], period)."""
     if time_us < schedule[1]:
         return False
@@ -396,7 +359,12 @@ def is_due(schedule: Vector, time_us: int) -> bool:
 
 @kernel
 def sense(
-    a: Fields, sample: Fields, inertial: Vector, compass: Vector, barometer: Vector, gps: Vector
+    a: record.Fields,
+    sample: record.Fields,
+    inertial: frames.Vector,
+    compass: frames.Vector,
+    barometer: frames.Vector,
+    gps: frames.Vector,
 ) -> None:
     """Sample the accelerometer, the gyro, and the slower sensors that are due.
 
@@ -408,7 +376,7 @@ def sense(
     # One row of white noise per sample, drawn in blocks by Python.
     white = inertial[a.noise_at[_INERTIAL]]
     a.noise_at[_INERTIAL] += 1
-    felt, turning = force(row), rates(row)
+    felt, turning = dynamics.force(row), dynamics.rates(row)
     # Biases are random walks; each sample adds its own white noise.
     for i in range(3):
         a.accel_bias[i] += sigma[6 + i] * white[6 + i]
@@ -421,11 +389,11 @@ def sense(
         white = compass[a.noise_at[_COMPASS]]
         a.noise_at[_COMPASS] += 1
         # The compass measures the earth's field in body axes.
-        field = MAGNETIC_FIELD_NED
-        seen = rotate(conjugate(quaternion(row)), (field[0], field[1], field[2]))
+        field = frames.MAGNETIC_FIELD_NED
+        seen = rotate(conjugate(dynamics.quaternion(row)), (field[0], field[1], field[2]))
         for i in range(3):
             sample.mag[i] = seen[i] + a.mag_sigma * white[i]
-        sample.measured |= MAG
+        sample.measured |= record.MAG
     if is_due(a.baro_rate, now_us):
         white = barometer[a.noise_at[_BAROMETER]]
         a.noise_at[_BAROMETER] += 1
@@ -433,7 +401,7 @@ def sense(
         a.baro_drift_pa += a.baro_step_pa * white[0]
         off_pa = a.baro_drift_pa + a.baro_noise_pa * white[1]
         sample.pressure_hpa = atmosphere.pressure_hpa(_HOME_M - row[2]) + off_pa / PA_PER_HPA
-        sample.measured |= PRESSURE
+        sample.measured |= record.PRESSURE
     if a.gps_fitted != 0 and is_due(a.gps_rate, now_us):
         white = gps[a.noise_at[_GPS]]
         a.noise_at[_GPS] += 1
@@ -442,17 +410,17 @@ def sense(
             a.gps_error[i] = a.gps_keep * a.gps_error[i] + a.gps_drive * white[i]
             sample.gps_position[i] = row[i] + a.gps_error[i] + a.gps_noise_m[i] * white[3 + i]
             sample.gps_velocity[i] = row[3 + i] + a.gps_noise_m_s * white[6 + i]
-        sample.measured |= GPS
+        sample.measured |= record.GPS
 
 
 @kernel
 def sense_record(
-    aircraft: Record,
-    sample: Record,
-    inertial: Vector,
-    compass: Vector,
-    barometer: Vector,
-    gps: Vector,
+    aircraft: record.Record,
+    sample: record.Record,
+    inertial: frames.Vector,
+    compass: frames.Vector,
+    barometer: frames.Vector,
+    gps: frames.Vector,
 ) -> None:
     """Sample the sensors of records (1,); see `sense`."""
     sense(aircraft[0], sample[0], inertial, compass, barometer, gps)
@@ -462,15 +430,15 @@ def sense_record(
 
 
 @kernel
-def _watch(c: Fields, row: int) -> None:
+def _watch(c: record.Fields, row: int) -> None:
     """Store the time of a new measurement of a sensor."""
-    c.watch[row, SEEN] = c.watch[row, CHANGED] = c.time_us
-    if c.watch[row, FIRST] < 0:
-        c.watch[row, FIRST] = c.time_us
+    c.watch[row, record.SEEN] = c.watch[row, record.CHANGED] = c.time_us
+    if c.watch[row, record.FIRST] < 0:
+        c.watch[row, record.FIRST] = c.time_us
 
 
 @kernel
-def _copied(new: Vector, old: Vector) -> bool:
+def _copied(new: frames.Vector, old: frames.Vector) -> bool:
     """Copy a sample (3,); return True if it differs from the previous sample."""
     changed = False
     for i in range(3):
@@ -481,7 +449,7 @@ def _copied(new: Vector, old: Vector) -> bool:
 
 
 @kernel
-def _take_inertial(c: Fields, sample: Fields) -> None:
+def _take_inertial(c: record.Fields, sample: record.Fields) -> None:
     """Read the measurements of every tick."""
     c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
     c.battery_left = sample.battery_left
@@ -490,40 +458,40 @@ def _take_inertial(c: Fields, sample: Fields) -> None:
 
 
 @kernel
-def _take(c: Fields, sample: Fields) -> int:
+def _take(c: record.Fields, sample: record.Fields) -> int:
     """Read the samples of the slower sensors; return the bits of repeated samples."""
     repeated = 0
-    if sample.measured & MAG:
+    if sample.measured & record.MAG:
         if _copied(sample.mag, c.mag):
-            _watch(c, MAG_ROW)
+            _watch(c, record.MAG_ROW)
         else:
-            repeated |= MAG
-    if sample.measured & PRESSURE:
+            repeated |= record.MAG
+    if sample.measured & record.PRESSURE:
         # Equality of floats is meant: a frozen sensor repeats its value exactly.
         if sample.pressure_hpa != c.pressure_hpa:
-            _watch(c, BARO_ROW)
+            _watch(c, record.BARO_ROW)
         else:
-            repeated |= PRESSURE
+            repeated |= record.PRESSURE
         c.pressure_hpa = sample.pressure_hpa
-    if sample.measured & GPS:
+    if sample.measured & record.GPS:
         moved = _copied(sample.gps_position, c.gps_position)
         # `_copied` first: `or` must not skip the copy.
         if _copied(sample.gps_velocity, c.gps_velocity) or moved:
-            _watch(c, GPS_ROW)
+            _watch(c, record.GPS_ROW)
         else:
-            repeated |= GPS
+            repeated |= record.GPS
     return repeated
 
 
 @kernel
-def fuse_gps(c: Fields, sample: Fields) -> bool:
+def fuse_gps(c: record.Fields, sample: record.Fields) -> bool:
     """Fuse a fix. Return False, without changes, if Python must check it first."""
-    if c.gps == OFF:
+    if c.gps == record.OFF:
         return True
     known = not math.isnan(c.origin[0])
     # A receiver that has been rejected for long may need a heading reset.
     recent = c.gps_horizontal_us >= 0 and c.time_us - c.gps_horizontal_us < REFUSED_US
-    if c.gps != TRUSTED or not (known and recent):
+    if c.gps != record.TRUSTED or not (known and recent):
         return False
     s, p, r_p, r_v = c.state, c.covariance, c.gps_variance[0], c.gps_variance[1]
     deviations = np.empty(3)
@@ -535,8 +503,8 @@ def fuse_gps(c: Fields, sample: Fields) -> bool:
         if not abs(deviations[i]) <= FAR:
             return False
     # The sample is relative to HOME; the filter's origin may differ.
-    here = local_to_geodetic(sample.gps_position, HOME)
-    place = geodetic_to_local(here, Geodetic(c.origin[0], c.origin[1], c.origin[2]))
+    here = frames.local_to_geodetic(sample.gps_position, frames.HOME)
+    place = frames.geodetic_to_local(here, frames.Geodetic(c.origin[0], c.origin[1], c.origin[2]))
     north, east, down = sample.gps_velocity[0], sample.gps_velocity[1], sample.gps_velocity[2]
     # Same order as `Estimator._fuse_gps`, so both give identical results.
     observe(c, north, east, math.sqrt(r_v))
@@ -562,7 +530,7 @@ def fuse_gps(c: Fields, sample: Fields) -> bool:
 
 
 @kernel
-def fuse_pressure(c: Fields) -> None:
+def fuse_pressure(c: record.Fields) -> None:
     """Fuse the barometer's sample."""
     height = atmosphere.altitude_m(c.pressure_hpa) - c.baro_origin_m
     c.innovation[0] = height + c.state[es.P + 2] - c.state[es.BARO_OFFSET]
@@ -574,15 +542,15 @@ def fuse_pressure(c: Fields) -> None:
 
 
 @kernel
-def fuse_heading(c: Fields) -> bool:
+def fuse_heading(c: record.Fields) -> bool:
     """Fuse the compass's sample; return False if Python must check its innovation first."""
-    if c.compass == OFF:
+    if c.compass == record.OFF:
         return True
-    if c.compass == SUSPECT:
+    if c.compass == record.SUSPECT:
         return False
     # At steep pitch the heading is not observable: nothing to fuse, nothing to check.
     if not es.observe_heading(
-        c.state, c.mag, MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, c.innovation, c.heading_h
+        c.state, c.mag, frames.MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, c.innovation, c.heading_h
     ):
         return True
     # The variance of the innovation decides whether it is calm.
@@ -597,18 +565,18 @@ def fuse_heading(c: Fields) -> bool:
 
 
 @kernel
-def _await_alignment(c: Fields, sample: Fields) -> bool:
+def _await_alignment(c: record.Fields, sample: record.Fields) -> bool:
     """Add a sample at rest to the sums; return True if Python must evaluate the sums."""
     _take_inertial(c, sample)
     _take(c, sample)
     add(c, sample.measured)
     # The first fix is a separate event, see `ALIGN`.
-    first_fix = sample.measured & GPS != 0 and c.rest_count[FIXES] == 1
+    first_fix = sample.measured & record.GPS != 0 and c.rest_count[FIXES] == 1
     return first_fix or c.time_us - c.rest_since_us >= ALIGN_US
 
 
 @large_kernel
-def estimate(c: Fields, sample: Fields) -> int:
+def estimate(c: record.Fields, sample: record.Fields) -> int:
     """Predict with the newest IMU sample, and fuse the other measurements of the tick.
 
     Returns the bits of the measurements that Python must fuse, as in `measured`, and of repeated
@@ -624,18 +592,18 @@ def estimate(c: Fields, sample: Fields) -> int:
     # Python decides whether a repeated sample is a fault or normal for this sensor.
     if repeated != 0:
         return sample.measured | repeated << REPEATED_BITS
-    if sample.measured & GPS and not fuse_gps(c, sample):
+    if sample.measured & record.GPS and not fuse_gps(c, sample):
         # Nothing is fused yet: Python fuses all of the tick in the usual order.
         return int(sample.measured)
-    if sample.measured & PRESSURE:
+    if sample.measured & record.PRESSURE:
         fuse_pressure(c)
-    if sample.measured & MAG and not fuse_heading(c):
-        return MAG
+    if sample.measured & record.MAG and not fuse_heading(c):
+        return record.MAG
     return 0
 
 
 @kernel
-def settle(c: Fields) -> bool:
+def settle(c: record.Fields) -> bool:
     """Update the estimator's health after all fusion of a tick; return True if it has changed."""
     healthy = 1 if es.converged(c.state, c.covariance) else 0
     changed: bool = healthy != c.healthy
@@ -645,7 +613,7 @@ def settle(c: Fields) -> bool:
 
 @kernel
 def begin_touch(
-    controller: Record, aircraft: Record, flown: Record, wind: Vector
+    controller: record.Record, aircraft: record.Record, flown: record.Record, wind: frames.Vector
 ) -> tuple[Vec, Vec, Vec]:
     """Start a tick of records (1,) in which another engine moves the body.
 
@@ -661,17 +629,17 @@ def begin_touch(
 
 @kernel
 def end_touch(
-    aircraft: Record,
-    sample: Record,
-    controller: Record,
-    after: Vector,
-    wind: Vector,
+    aircraft: record.Record,
+    sample: record.Record,
+    controller: record.Record,
+    after: frames.Vector,
+    wind: frames.Vector,
     standing: bool,
-    inertial: Vector,
-    compass: Vector,
-    barometer: Vector,
-    gps: Vector,
-    truth: Record,
+    inertial: frames.Vector,
+    compass: frames.Vector,
+    barometer: frames.Vector,
+    gps: frames.Vector,
+    truth: record.Record,
 ) -> int:
     """End a tick of records (1,), given the motion (16,) after it: measure and estimate.
 
@@ -691,19 +659,19 @@ def end_touch(
 
 
 @kernel
-def log_flown_record(controller: Record, flown: Record) -> None:
+def log_flown_record(controller: record.Record, flown: record.Record) -> None:
     """Log a flight controller's record (1,) in a tick; see `log_flown`."""
     log_flown(controller[0], flown[0])
 
 
 @kernel
-def log_record(aircraft: Record, truth: Record) -> None:
+def log_record(aircraft: record.Record, truth: record.Record) -> None:
     """Log an aircraft's record (1,) after a tick; see `log`."""
     log(aircraft[0], truth[0])
 
 
 @kernel
-def settle_record(controller: Record) -> bool:
+def settle_record(controller: record.Record) -> bool:
     """Update the estimator's health in a record (1,); return True if it has changed."""
     return settle(controller[0])
 
@@ -713,17 +681,17 @@ def settle_record(controller: Record) -> bool:
 
 @large_kernel
 def stretch(
-    aircraft: Record,
-    sample: Record,
-    controller: Record,
+    aircraft: record.Record,
+    sample: record.Record,
+    controller: record.Record,
     ticks: int,
-    inertial: Vector,
-    compass: Vector,
-    barometer: Vector,
-    gps: Vector,
-    wind: Vector,
-    truths: Record,
-    flown: Record,
+    inertial: frames.Vector,
+    compass: frames.Vector,
+    barometer: frames.Vector,
+    gps: frames.Vector,
+    wind: frames.Vector,
+    truths: record.Record,
+    flown: record.Record,
 ) -> int:
     """Fly up to `ticks` ticks, at least 1, at a constant demand, and update the three records (1,).
 
@@ -734,7 +702,7 @@ def stretch(
     flown and logged, and its measurements wait in the sample.
     """
     a, seen, c = aircraft[0], sample[0], controller[0]
-    after, at, steady = np.empty(WIDTH), a.noise_at, len(wind) == 1
+    after, at, steady = np.empty(dynamics.WIDTH), a.noise_at, len(wind) == 1
     for k in range(ticks):
         # One tick needs at most one row of each block: check all before anything moves.
         if (

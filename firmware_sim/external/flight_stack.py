@@ -12,20 +12,13 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim import interfaces
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.parameters import GROUND_LOSS, differences
 from firmware_sim.external.programs import firmware_kind
-from firmware_sim.interfaces import (
-    ULOG_SUFFIX,
-    ActuatorControls,
-    FirmwareLostError,
-    FirmwareMissingError,
-    SensorSample,
-    TrueState,
-)
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.px4_links import UdpLinks
@@ -85,7 +78,7 @@ class ExternalFlightController:
         self._observer = observer
         self._launcher = launcher
         self._output = tuple(launcher.airframe.motors.index(corner) for corner in CORNERS)
-        self._sample: SensorSample | None = None
+        self._sample: interfaces.SensorSample | None = None
         self.rate_hz = bridge.rate_hz
         self.use_truth = bridge.use_truth
 
@@ -103,13 +96,15 @@ class ExternalFlightController:
         """Phase and mode from the heartbeat, with the armed state from the faster bridge."""
         return self._observer.flight(armed=self._bridge.armed)
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Advance the firmware to the sample's time. Raises FirmwareLostError."""
         self._sample = sample
         controls = self._bridge.step(sample)
         m = controls.motors
         a, b, c, d = self._output
-        return ActuatorControls(controls.time_us, (m[a], m[b], m[c], m[d]), armed=controls.armed)
+        return interfaces.ActuatorControls(
+            controls.time_us, (m[a], m[b], m[c], m[d]), armed=controls.armed
+        )
 
     def close(self) -> None:
         """Stop firmware started here; otherwise command it to reboot or shut down."""
@@ -124,7 +119,7 @@ class ExternalFlightController:
             return
         self._observer.end(reboot=self._launcher.reboots)
         period_us = US_PER_S // self.rate_hz
-        with suppress(FirmwareLostError):
+        with suppress(interfaces.FirmwareLostError):
             for _ in range(round(FAREWELL_S * self.rate_hz)):
                 sample = sample._replace(time_us=sample.time_us + period_us)
                 self._bridge.step(sample)
@@ -173,7 +168,7 @@ class ExternalFlightStack:
         """Log the observer's link to a tlog. The firmware's flight log is copied beside it."""
         self._observer.log_to(tlog)
         if tlog is not None:
-            self._launcher.flight_log = tlog.path.with_suffix(ULOG_SUFFIX)
+            self._launcher.flight_log = tlog.path.with_suffix(interfaces.ULOG_SUFFIX)
 
     def strangers(self) -> tuple[str, ...]:
         """Return an empty tuple: traffic on the firmware's links is not inspected."""
@@ -185,7 +180,7 @@ class ExternalFlightStack:
         self._observer.restart()
         return ExternalFlightController(self._launcher, self._observer)
 
-    def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], interfaces.TrueState]) -> None:
         """Run the boot sequence on the ground until the frame is checked and arming is possible.
 
         `tick` flies a tick and returns its simulated time [µs].
@@ -204,7 +199,7 @@ class ExternalFlightStack:
         observer.acts_as_ground_station = not parameters.values.get(GROUND_LOSS, 0)
         problem = airframe.problem(parameters.values)
         if problem is not None:
-            raise FirmwareMissingError(problem)
+            raise interfaces.FirmwareMissingError(problem)
         if self._launcher.may_set:
             wanted = airframe.settings
             self._until(tick, self._asking(lambda: parameters.set(wanted)), "set parameters")
@@ -248,7 +243,7 @@ class ExternalFlightStack:
             if late or (silent and clock.time_us() > self._timeout_s * US_PER_S):
                 left = f" ({_some(self._missing)})" if self._missing else ""
                 spent_s = simulated_us / US_PER_S
-                raise FirmwareMissingError(
+                raise interfaces.FirmwareMissingError(
                     f"{self._launcher.airframe.firmware} runs, but {what}{left} did not arrive in "
                     f"{clock.time_us() / US_PER_S:.0f} s ({spent_s:.0f} s simulated); it said: "
                     f"{observer.last_text or 'nothing'}"

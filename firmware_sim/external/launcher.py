@@ -17,14 +17,8 @@ import psutil
 from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import Patience
 from airl_mav.core.files import PARTIAL_SUFFIX
+from firmware_sim import interfaces
 from firmware_sim.external.parameters import RequiredAirframe
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    FirmwareLostError,
-    FirmwareMissingError,
-    SensorSample,
-    TrueState,
-)
 
 
 def no_process() -> None:
@@ -52,7 +46,7 @@ class Bridge(Protocol):
             FirmwareLostError: Raised by `alive`.
         """
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Send a tick's sensors; return the motor commands until the next tick.
 
         Raises:
@@ -60,7 +54,7 @@ class Bridge(Protocol):
             FirmwareMissingError: The firmware is connected, but cannot be flown.
         """
 
-    def use_truth(self, truth: Callable[[], TrueState]) -> None:
+    def use_truth(self, truth: Callable[[], interfaces.TrueState]) -> None:
         """Set the source of the true state."""
 
     def close(self) -> None:
@@ -126,13 +120,13 @@ class Launcher:
         """Wait for the connection; FirmwareMissingError also if the program exits first."""
         try:
             bridge.wait_connected(self._timeout_s, alive)
-        except FirmwareLostError as error:
+        except interfaces.FirmwareLostError as error:
             child = self._child
             exited = None if child is None else child.poll()
             if child is None or exited is None or exited.by_signal:
                 raise
             tail = child.log_tail().splitlines()
-            raise FirmwareMissingError(
+            raise interfaces.FirmwareMissingError(
                 f"{child.name} ended at once ({exited}): {tail[-1] if tail else 'no word of it'}; "
                 f"log: {child.log}"
             ) from error
@@ -286,7 +280,7 @@ class FirmwareProcess(ChildProcess):
         self.name = name
         program = Path(command.argv[0])
         if not os.access(program, os.X_OK) or not program.is_file():
-            raise FirmwareMissingError(f"{name}: {program}: not an executable program")
+            raise interfaces.FirmwareMissingError(f"{name}: {program}: not an executable program")
         super().__init__(command.argv, log, guarded=True, cwd=cwd, environment=command.environment)
 
     def check(self) -> None:
@@ -294,7 +288,7 @@ class FirmwareProcess(ChildProcess):
         exited = self.poll()
         if exited is not None:
             tail = self.log_tail()
-            raise FirmwareLostError(
+            raise interfaces.FirmwareLostError(
                 f"{self.name} ended ({exited}); log: {self.log}" + (f"\n{tail}" if tail else "")
             )
 

@@ -16,14 +16,8 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
+from firmware_sim.external import parameters
 from firmware_sim.external.launcher import StartCommand
-from firmware_sim.external.parameters import (
-    SITL_OUTPUT,
-    RequiredAirframe,
-    Value,
-    px4_airframe,
-    qgroundcontrol_file,
-)
 from firmware_sim.interfaces import FirmwareMissingError
 
 
@@ -31,9 +25,9 @@ from firmware_sim.interfaces import FirmwareMissingError
 class FirmwareKind:
     """Kind of real firmware: a value of `--firmware`."""
 
-    airframe: Callable[[VehicleProfile], RequiredAirframe]
+    airframe: Callable[[VehicleProfile], parameters.RequiredAirframe]
     """Return the configuration that a vehicle requires, or raise FirmwareMissingError."""
-    parameter_file: Callable[[Mapping[str, Value]], str]
+    parameter_file: Callable[[Mapping[str, parameters.Value]], str]
     """Return a file with parameters for the firmware's tools."""
     parts: str
     """Function that binds the ports of a `flight_stack.Wanted`, as `module:name`."""
@@ -171,8 +165,8 @@ def _how_to_start_px4(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None
 
 
 PX4 = FirmwareKind(
-    airframe=partial(px4_airframe, output=SITL_OUTPUT),
-    parameter_file=qgroundcontrol_file,
+    airframe=partial(parameters.px4_airframe, output=parameters.SITL_OUTPUT),
+    parameter_file=parameters.qgroundcontrol_file,
     parts="firmware_sim.external.px4_sitl:px4_parts",
     check_program=_check_px4,
     how_to_start=_how_to_start_px4,

@@ -19,11 +19,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.scheduling import ask_for_short_slices
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
-from firmware_sim.external.flight_stack import (
-    ExternalFlightStack,
-    FirmwareRequest,
-    instance_endpoint,
-)
+from firmware_sim.external import flight_stack
 from firmware_sim.external.observer import SYSTEM_ID, FirmwareObserver
 from firmware_sim.external.programs import API_LOCAL_PORT, API_PORT, check_free, find_px4
 from firmware_sim.external.px4_sitl import Px4Bridge, px4_parts
@@ -52,7 +48,9 @@ class OnboardLink:
 
     def __init__(self, instance: int, alive: Callable[[], None]) -> None:
         """Bind the port of an instance; `alive` is polled in waits and raises if PX4 is lost."""
-        self._endpoint = instance_endpoint(API_PORT + instance, API_LOCAL_PORT + instance)
+        self._endpoint = flight_stack.instance_endpoint(
+            API_PORT + instance, API_LOCAL_PORT + instance
+        )
         self._alive = alive
         self._encoder = Encoder(SYSTEM_ID, COMPONENT_ID)
         self._echoes = 0
@@ -128,7 +126,7 @@ LOOK_US = US_PER_S // 50
 class ConductedPx4:
     """PX4 with its links and functions for a lockstep scheduler."""
 
-    stack: ExternalFlightStack
+    stack: flight_stack.ExternalFlightStack
     link: OnboardLink
     """Companion's link; closed with the stack."""
     settle: Callable[[], None]
@@ -145,7 +143,7 @@ def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None)
     """
     ask_for_short_slices()
     real = aircraft.real
-    request = FirmwareRequest(aircraft, vehicle, log, _no_ends)
+    request = flight_stack.FirmwareRequest(aircraft, vehicle, log, _no_ends)
     if real.px4_dir is None:
         return _instance(request, real.instance)
     find_px4(real.px4_dir)
@@ -170,7 +168,7 @@ def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None)
     ) from taken
 
 
-def _instance(request: FirmwareRequest, instance: int) -> ConductedPx4:
+def _instance(request: flight_stack.FirmwareRequest, instance: int) -> ConductedPx4:
     newest: list[Px4Bridge] = []
 
     def bridge(port: int) -> Px4Bridge:
@@ -192,7 +190,7 @@ def _instance(request: FirmwareRequest, instance: int) -> ConductedPx4:
         endpoint.close()
         launcher.close()
         raise
-    stack = ExternalFlightStack(
+    stack = flight_stack.ExternalFlightStack(
         launcher,
         FirmwareObserver(endpoint, "observer", request.vehicle.told_origin),
         request.aircraft.real.firmware_timeout,

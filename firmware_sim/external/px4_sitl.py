@@ -17,7 +17,9 @@ from typing import Any
 from airl_mav.core.clock import Patience, WallClock
 from airl_mav.core.constants import LOOPBACK, MS_PER_S, TICK_HZ, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
+from firmware_sim import interfaces
 from firmware_sim.external import hil_messages as hil
+from firmware_sim.external import programs
 from firmware_sim.external.flight_stack import FirmwareRequest, instance_endpoint
 from firmware_sim.external.launcher import (
     Launcher,
@@ -27,22 +29,6 @@ from firmware_sim.external.launcher import (
     program_at,
 )
 from firmware_sim.external.parameters import SITL_OUTPUT, px4_airframe
-from firmware_sim.external.programs import (
-    MODEL,
-    PAYLOAD_LOCAL_PORT,
-    PAYLOAD_PORT,
-    SIMULATOR_PORT,
-    UNAWAITED_THREADS,
-    check_free,
-    find_px4,
-)
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    FirmwareLostError,
-    FirmwareMissingError,
-    SensorSample,
-    TrueState,
-)
 from firmware_sim.mavlink.codec import Decoder, Encoder, Values, WireLayout, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.streams.status import hil_state_quaternion
@@ -258,7 +244,7 @@ class Px4Bridge:
         self._alive: Callable[[], None] = no_process
         self._decoder = Decoder(datagrams=False)
         self._encoder = Encoder()
-        self._truth: Callable[[], TrueState] | None = None
+        self._truth: Callable[[], interfaces.TrueState] | None = None
         self._state_us, self._state_due_us = STATE_US, 0
         self._first_us: int | None = None
         """Simulated time of the first sample [µs]."""
@@ -281,13 +267,14 @@ class Px4Bridge:
         """Wait until PX4 has connected; see `Bridge`."""
         self._alive = alive
         if not self._tcp.accept(timeout_s, alive):
-            raise FirmwareMissingError(
+            raise interfaces.FirmwareMissingError(
                 f"PX4 did not connect to TCP port {self.port} within {timeout_s:g} s: is it "
-                f"running, with PX4_SIM_MODEL={MODEL} and -i {self.port - SIMULATOR_PORT}?"
+                f"running, with PX4_SIM_MODEL={programs.MODEL} and "
+                f"-i {self.port - programs.SIMULATOR_PORT}?"
             )
         pid = program_at(*self._tcp.peer, self.port)
         if pid is not None:
-            self._program = RunningProgram(pid, UNAWAITED_THREADS)
+            self._program = RunningProgram(pid, programs.UNAWAITED_THREADS)
 
     def settle(self) -> None:
         """Wait until PX4 has done all work due by its clock, as far as observable.
@@ -306,11 +293,11 @@ class Px4Bridge:
                 f"is stopped (process {self._program.pid}, SIGSTOP): SIGCONT resumes it"
             )
 
-    def use_truth(self, truth: Callable[[], TrueState]) -> None:
+    def use_truth(self, truth: Callable[[], interfaces.TrueState]) -> None:
         """Set the source of the true state."""
         self._truth = truth
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Advance PX4 to the sample's time; see `Bridge`. Motors are stopped until it replies."""
         if self._first_us is None:
             self._first_us = sample.time_us
@@ -322,7 +309,7 @@ class Px4Bridge:
         if self._answer is None:
             self._receive(0.0)
             if self._answer is None:
-                return ActuatorControls(sample.time_us, hil.STILL, armed=False)
+                return interfaces.ActuatorControls(sample.time_us, hil.STILL, armed=False)
         try:
             return hil.controls(self._answered(), sample.time_us)
         except hil.ControlsError as error:
@@ -349,7 +336,7 @@ class Px4Bridge:
                 f"connected, but answered none of {self.unanswered} samples in {self._start_s:g} s"
             )
 
-    def _send(self, sample: SensorSample, now_us: int) -> None:
+    def _send(self, sample: interfaces.SensorSample, now_us: int) -> None:
         encoder = self._encoder
         # HIL_SENSOR goes last: it advances PX4's clock and triggers the reply.
         data = b""
@@ -433,7 +420,7 @@ class Px4Bridge:
     def _take_answer(self, message: hil.Controls) -> None:
         time_us: int = message.time_usec
         if not hil.lockstep(message):
-            raise FirmwareMissingError(
+            raise interfaces.FirmwareMissingError(
                 f"PX4 on TCP port {self.port} does not wait for the simulator: it must be built "
                 "with lockstep (make px4_sitl_default)"
             )
@@ -462,12 +449,12 @@ class Px4Bridge:
         self._state_us = max(wanted_us, self._least_state_us)
         self._state_due_us = NEVER_US if asked < 0.0 else self._sent_us
 
-    def _lost(self, what: str) -> FirmwareLostError:
+    def _lost(self, what: str) -> interfaces.FirmwareLostError:
         notes = [f"{self._decoder.malformed} runs of garbage"] if self._decoder.malformed else []
         if self._tcp.refused:
             notes.append(f"{self._tcp.refused} other connections refused")
         more = f" ({', '.join(notes)})" if notes else ""
-        return FirmwareLostError(
+        return interfaces.FirmwareLostError(
             f"PX4 on TCP port {self.port} {what}, at {_seconds(self._sent_us)} of its clock{more}"
         )
 
@@ -491,13 +478,15 @@ def px4_parts(
         instance = options.instance
         if options.px4_dir is not None:
             # With a taken port, PX4 would start without its links, or not at all, in every flight.
-            check_free(instance)
+            programs.check_free(instance)
     airframe = px4_airframe(request.vehicle, SITL_OUTPUT)
-    program = None if options.px4_dir is None else find_px4(options.px4_dir)
-    endpoint = instance_endpoint(PAYLOAD_PORT + instance, PAYLOAD_LOCAL_PORT + instance)
+    program = None if options.px4_dir is None else programs.find_px4(options.px4_dir)
+    endpoint = instance_endpoint(
+        programs.PAYLOAD_PORT + instance, programs.PAYLOAD_LOCAL_PORT + instance
+    )
     launcher = Launcher(
         airframe,
-        partial(bridge, SIMULATOR_PORT + instance),
+        partial(bridge, programs.SIMULATOR_PORT + instance),
         options.firmware_timeout,
         reboots=False,
         program=None if program is None else partial(program.start, instance, airframe.autostart),

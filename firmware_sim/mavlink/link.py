@@ -17,16 +17,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
-from firmware_sim.mavlink.codec import (
-    SYSTEM_ID,
-    Decoder,
-    Encoder,
-    Values,
-    WireLayout,
-    WireMessage,
-    layout,
-    trimmed,
-)
+from firmware_sim.mavlink import codec
 from firmware_sim.mavlink.endpoint import Sender
 from firmware_sim.mavlink.px4_links import LinkConfig
 from firmware_sim.mavlink.streams import Builder
@@ -85,7 +76,7 @@ class Link:
         replies: Mapping[str, Builder | None] | None = None,
         *,
         endpoint: Sender | None = None,
-        system_id: int = SYSTEM_ID,
+        system_id: int = codec.SYSTEM_ID,
         signing: Signing | None = None,
         link_id: int = 0,
     ) -> None:
@@ -109,14 +100,16 @@ class Link:
         """Callback for the frames of both directions; None = disabled."""
         self.ignored = 0
         self.endpoint: Sender = config.endpoint if endpoint is None else endpoint
-        self._streams = {name: (layout(name), build) for name, build in builders.items() if build}
+        self._streams = {
+            name: (codec.layout(name), build) for name, build in builders.items() if build
+        }
         self._replies = builders if replies is None else replies
-        self._stream_encoder = Encoder(system_id)
+        self._stream_encoder = codec.Encoder(system_id)
         self._reply_encoder = (
             # Separate encoders keep the telemetry's sequence numbers independent of requests.
-            Encoder(system_id) if config.separate_replies else self._stream_encoder
+            codec.Encoder(system_id) if config.separate_replies else self._stream_encoder
         )
-        self._decoder = Decoder(datagrams=config.endpoint.datagrams)
+        self._decoder = codec.Decoder(datagrams=config.endpoint.datagrams)
         self._signing = signing
         self._link_id = link_id
         self.pending: list[bytes] = []
@@ -144,7 +137,7 @@ class Link:
         self._stream_encoder.identify(system_id)
         self._reply_encoder.identify(system_id)
 
-    def decode(self, chunk: bytes) -> list[WireMessage]:
+    def decode(self, chunk: bytes) -> list[codec.WireMessage]:
         """Return the messages in a chunk of bytes from this client."""
         messages = self._decoder.feed(chunk)
         # Frames are checked after decoding: signatures do not change the payload.
@@ -155,7 +148,7 @@ class Link:
         self.note(messages)
         return messages
 
-    def note(self, messages: Sequence[WireMessage]) -> None:
+    def note(self, messages: Sequence[codec.WireMessage]) -> None:
         """Count and log messages from this client."""
         self._rx += len(messages)
         if self.tap is not None and messages:
@@ -163,7 +156,7 @@ class Link:
 
     # --- answers
 
-    def send(self, message: WireMessage) -> None:
+    def send(self, message: codec.WireMessage) -> None:
         """Send a message. Drops and counts a message with values out of range."""
         frame = self._packed(self._reply_encoder, message)
         if frame is not None:
@@ -171,7 +164,7 @@ class Link:
 
     def send_payload(self, name: str, payload: bytes) -> None:
         """Send a message given by name and full payload."""
-        self._reply(self._reply_encoder.frame(layout(name), trimmed(payload)))
+        self._reply(self._reply_encoder.frame(codec.layout(name), codec.trimmed(payload)))
 
     def send_stream(self, name: str, state: AutopilotState) -> bool:
         """Send a streamed message now; return True if it had content."""
@@ -180,12 +173,12 @@ class Link:
         if builder is None:
             payload = fast_payload(name, state)
         else:
-            payload = _payload(layout(name), builder(state))
+            payload = _payload(codec.layout(name), builder(state))
         if payload is None:
             return False
         # Empty bytes mean that a value does not fit its field.
         if payload:
-            self._reply(self._reply_encoder.frame(layout(name), payload))
+            self._reply(self._reply_encoder.frame(codec.layout(name), payload))
         else:
             self._unsendable += 1
         return True
@@ -208,7 +201,7 @@ class Link:
 
     # --- telemetry
 
-    def stream(self, message: WireMessage) -> None:
+    def stream(self, message: codec.WireMessage) -> None:
         """Add a message to this tick's telemetry. Handles values out of range like `send`."""
         frame = self._packed(self._stream_encoder, message)
         if frame is not None:
@@ -276,7 +269,7 @@ class Link:
     def _signed(self, frame: bytes) -> bytes:
         return frame if self._signing is None else self._signing.sign(frame, self._link_id)
 
-    def _packed(self, encoder: Encoder, message: WireMessage) -> bytes | None:
+    def _packed(self, encoder: codec.Encoder, message: codec.WireMessage) -> bytes | None:
         try:
             return encoder.pack(message)
         except (struct.error, OverflowError):
@@ -284,7 +277,7 @@ class Link:
             return None
 
 
-def _payload(shape: WireLayout, values: Values | None) -> bytes | None:
+def _payload(shape: codec.WireLayout, values: codec.Values | None) -> bytes | None:
     """Return the payload; empty if a value is out of range, None without values."""
     if values is None:
         return None

@@ -18,6 +18,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import TrueState
+from firmware_sim.mavlink import streams
 from firmware_sim.mavlink.clients import Allowance, Client, Clients, Complaints, TickTime
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.endpoint import (
@@ -28,13 +29,6 @@ from firmware_sim.mavlink.endpoint import (
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
 from firmware_sim.mavlink.services import Context, connection, handle, send_pending, sender, table
-from firmware_sim.mavlink.streams import (
-    BUILDERS,
-    VEHICLE_BUILDERS,
-    Builder,
-    Vehicle,
-    addon_builders,
-)
 from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import REPLY_IDS, EventBuffer, EventSender, TextEncoder
@@ -108,7 +102,7 @@ class MavlinkServer:
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
-        self._vehicle, self._context = Vehicle(boot_unix_us), TickContext()
+        self._vehicle, self._context = streams.Vehicle(boot_unix_us), TickContext()
         self._texts: list[OperatorText] = []
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._answers_apart = any(config.separate_replies for config in links)
@@ -121,10 +115,13 @@ class MavlinkServer:
         self._senders = Senders()
         self.strangers = self._senders.strangers
         # All links share these builders, so each message is built once per tick.
-        self._builders: dict[str, Builder | None] = {
-            **BUILDERS,
-            **addon_builders(),
-            **{name: partial(build, self._vehicle) for name, build in VEHICLE_BUILDERS.items()},
+        self._builders: dict[str, streams.Builder | None] = {
+            **streams.BUILDERS,
+            **streams.addon_builders(),
+            **{
+                name: partial(build, self._vehicle)
+                for name, build in streams.VEHICLE_BUILDERS.items()
+            },
             **{name: each.build for name, each in sensor_table.streams().items()},
             "TIMESYNC": None,
         }
@@ -401,7 +398,7 @@ class MavlinkServer:
                 for client, _message in clients.receive(self._now_us):
                     client.link.ignored += 1
 
-    def _link_builders(self) -> dict[str, Builder | None]:
+    def _link_builders(self) -> dict[str, streams.Builder | None]:
         return {
             **self._builders,
             "PING": connection.ping_requests(),

@@ -21,27 +21,13 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Shape
 from airl_mav.arena.ground import Ground
+from airl_mav.core import frames
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
-from airl_mav.core.frames import (
-    Vector,
-    ned_to_enu,
-    quat_from_euler,
-    quat_ned_frd_to_enu_flu,
-    quat_to_matrix,
-    quat_wxyz_to_xyzw,
-)
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec
-from firmware_sim.engine.dynamics import (
-    POSITION,
-    QUATERNION,
-    RATES,
-    VELOCITY,
-    WIDTH,
-    from_bullet,
-)
+from firmware_sim.engine import dynamics
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch, place_at, tour_arrays, walls_of
 
 
@@ -103,12 +89,12 @@ Xyzw = tuple[float, float, float, float]
 @kernel
 def _due(
     time_us: int,
-    vehicle: Vector,
-    times_s: Vector,
-    points: Vector,
+    vehicle: frames.Vector,
+    times_s: frames.Vector,
+    points: frames.Vector,
     leg: NDArray[np.int64],
-    reach: Vector,
-    place: Vector,
+    reach: frames.Vector,
+    place: frames.Vector,
     due: NDArray[np.int64],
 ) -> int:
     """Find moving obstacles near the vehicle, by their current or by their last updated position.
@@ -165,7 +151,7 @@ class Movers:
         """Return the number of moving obstacles."""
         return len(self._bodies)
 
-    def move(self, time_us: int, vehicle: Vector, client: int) -> None:
+    def move(self, time_us: int, vehicle: frames.Vector, client: int) -> None:
         """Update bodies near a vehicle at (>= 2,) NED [m], `time_us` [µs] after the start."""
         due, place = self._due, self._place
         count = _due(
@@ -180,7 +166,9 @@ class Movers:
 
 def facing(yaw: float) -> Xyzw:
     """Return pybullet's attitude of a level body with heading `yaw` [rad], 0 = north."""
-    return quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quat_from_euler(0.0, 0.0, yaw)))
+    return frames.quat_wxyz_to_xyzw(
+        frames.quat_ned_frd_to_enu_flu(frames.quat_from_euler(0.0, 0.0, yaw))
+    )
 
 
 LEVEL = facing(0.0)
@@ -254,7 +242,7 @@ class BulletWorld:
             _idle.append(self.client)
             self.client, self.number = None, NO_CLIENT
 
-    def move_obstacles(self, time_us: int, vehicle: Vector) -> None:
+    def move_obstacles(self, time_us: int, vehicle: frames.Vector) -> None:
         """Move the moving obstacles to their positions `time_us` [µs] after the start.
 
         Bodies far from the vehicle, at (>= 2,) NED [m], are not updated: contacts are impossible.
@@ -262,11 +250,11 @@ class BulletWorld:
         if self._movers is not None:
             self._movers.move(time_us, vehicle, self.number)
 
-    def _add(self, shape: int, center: Vector, attitude: Xyzw, name: str) -> int:
+    def _add(self, shape: int, center: frames.Vector, attitude: Xyzw, name: str) -> int:
         body = self.client.createMultiBody(
             baseMass=0.0,
             baseCollisionShapeIndex=shape,
-            basePosition=ned_to_enu(center),
+            basePosition=frames.ned_to_enu(center),
             baseOrientation=attitude,
             # A rigid body at rest takes no time per step. A multi-body, pybullet's default, runs
             # Featherstone's algorithm every step, and an awake one gets a new bounding box.
@@ -279,7 +267,7 @@ class BulletWorld:
     def _add_ground(self, ground: Ground) -> None:
         shape = self.client.createCollisionShape(
             pybullet.GEOM_MESH,
-            vertices=ned_to_enu(ground.points).tolist(),
+            vertices=frames.ned_to_enu(ground.points).tolist(),
             indices=ground.faces.ravel().tolist(),
             flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
         )
@@ -354,7 +342,9 @@ class BulletBody:
         world, self.touch = state
         self.world.restore(world)
 
-    def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
+    def move(
+        self, at: Vec, force: Vec, torque: Vec, before: frames.Vector, moving_us: int
+    ) -> frames.Vector:
         """Move the body by one tick; see `PlantBody`."""
         world, number = self.world, self.number
         client = world.number
@@ -384,7 +374,7 @@ class BulletBody:
         velocity: Vec = _STILL,
         quaternion: Quat = _LEVEL,
         rates: Vec = _STILL,
-    ) -> Vector:
+    ) -> frames.Vector:
         """Place the body in a motion; see `PlantBody`."""
         self.follow(np.array([*position, *velocity, *quaternion, *rates]))
         return self.rest()
@@ -392,31 +382,33 @@ class BulletBody:
     def look_around(self) -> None:
         """Do nothing: every `move` updates the moving obstacles."""
 
-    def follow(self, motion: Vector) -> None:
+    def follow(self, motion: frames.Vector) -> None:
         """Set the motion (>= 13,) of the body; see `PlantBody`."""
         client, number = self.world.client, self.number
-        quaternion = motion[QUATERNION]
-        attitude = quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quaternion))
-        client.resetBasePositionAndOrientation(number, ned_to_enu(motion[POSITION]), attitude)
-        spin = ned_to_enu(quat_to_matrix(quaternion) @ motion[RATES])
-        client.resetBaseVelocity(number, ned_to_enu(motion[VELOCITY]), spin)
+        quaternion = motion[dynamics.QUATERNION]
+        attitude = frames.quat_wxyz_to_xyzw(frames.quat_ned_frd_to_enu_flu(quaternion))
+        client.resetBasePositionAndOrientation(
+            number, frames.ned_to_enu(motion[dynamics.POSITION]), attitude
+        )
+        spin = frames.ned_to_enu(frames.quat_to_matrix(quaternion) @ motion[dynamics.RATES])
+        client.resetBaseVelocity(number, frames.ned_to_enu(motion[dynamics.VELOCITY]), spin)
         self.touch = NOTHING
 
-    def rest(self) -> Vector:
+    def rest(self) -> frames.Vector:
         """Return the motion (16,), without acceleration."""
         return self._read(None)
 
-    def _read(self, before: Vector | None) -> Vector:
+    def _read(self, before: frames.Vector | None) -> frames.Vector:
         """Return pybullet's state as a row; zero acceleration without `before`."""
         client, number = self.world.number, self.number
         at, orientation = pybullet.getBasePositionAndOrientation(number, client)
         linear, angular = pybullet.getBaseVelocity(number, client)
-        row = np.empty(WIDTH)
+        row = np.empty(dynamics.WIDTH)
         # Without a motion before, difference from the current velocity: zero acceleration.
         if before is None:
             before = row
             before[3], before[4], before[5] = linear[1], linear[0], -linear[2]
-        from_bullet(at, orientation, linear, angular, before, self._tick_s, row)
+        dynamics.from_bullet(at, orientation, linear, angular, before, self._tick_s, row)
         return row
 
     def _build(self, body: BodyProfile, airframe: Airframe) -> int:

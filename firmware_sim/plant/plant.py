@@ -21,15 +21,7 @@ from airl_mav.vehicle.atmosphere import Wind
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
 from firmware_sim.autopilot.climb import climb_record
-from firmware_sim.engine.dynamics import (
-    POSITION,
-    QUATERNION,
-    RATES,
-    VELOCITY,
-    Speeds,
-    pack_row,
-    supply,
-)
+from firmware_sim.engine import dynamics
 from firmware_sim.engine.record import Record, new_aircraft
 from firmware_sim.engine.ticks import (
     CLIMBED,
@@ -86,7 +78,7 @@ starts contacts (`BREAKING_SHARE`)."""
 NEVER_US = 1 << 61
 """Start time of the tours of held obstacles [µs]."""
 
-STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
+STOPPED: dynamics.Speeds = (0.0, 0.0, 0.0, 0.0)
 
 
 class Blowing(Protocol):
@@ -158,7 +150,7 @@ class Plant:
         model = PowerModel.from_profile(profile)
         self.rotor_lag = lag(airframe, tick_s)
         """Fraction of a rotor speed error that remains after a tick."""
-        pack, power_w = pack_row(profile.battery), standing_power_w(0.0, airframe, model)
+        pack, power_w = dynamics.pack_row(profile.battery), standing_power_w(0.0, airframe, model)
         self.body: PlantBody = new_body(asked.plant, arena, profile.body, airframe, tick_s)
         """Vehicle body among the bodies of the arena."""
         self._room = Room(arena, profile.body)
@@ -182,7 +174,10 @@ class Plant:
             ("charge", asked.battery_charge),
             ("power_w", power_w),
             ("motion", self.body.rest()),
-            ("battery", supply(power_w + computer_w, asked.battery_charge, np.array(pack))),
+            (
+                "battery",
+                dynamics.supply(power_w + computer_w, asked.battery_charge, np.array(pack)),
+            ),
         ):
             record[name] = value
         self._motion = record["motion"][0]
@@ -241,11 +236,11 @@ class Plant:
     @property
     def position(self) -> tuple[float, float, float]:
         """Position of the vehicle, NED [m]."""
-        north, east, down = self._motion[POSITION].tolist()
+        north, east, down = self._motion[dynamics.POSITION].tolist()
         return north, east, down
 
     @property
-    def rotor_speeds(self) -> Speeds:
+    def rotor_speeds(self) -> dynamics.Speeds:
         """Rotor speeds as fractions of the speed at full command, in motor order."""
         a, b, c, d = self.record["speeds"][0].tolist()
         return a, b, c, d
@@ -366,7 +361,7 @@ class Plant:
         self._move(controls.motors, wind)
         return self.sense()
 
-    def _move(self, motors: Speeds, wind: Vector) -> None:
+    def _move(self, motors: dynamics.Speeds, wind: Vector) -> None:
         record = self.record
         # An empty battery stops the motors.
         motors = motors if record["charge"][0] > 0.0 else STOPPED
@@ -426,10 +421,10 @@ class Plant:
         row = self.motion.copy()
         return TrueState(
             self.time_us,
-            row[POSITION],
-            row[VELOCITY],
-            row[QUATERNION],
-            row[RATES],
+            row[dynamics.POSITION],
+            row[dynamics.VELOCITY],
+            row[dynamics.QUATERNION],
+            row[dynamics.RATES],
             self.power_w,
             self.battery_remaining,
         )
@@ -452,7 +447,7 @@ class Plant:
         # Contacts flicker: a contact ends when the bodies are no longer close.
         touching = touch.pressed | (self._touching & touch.close)
         if touching - self._touching:
-            speed = math.sqrt(sum(v * v for v in before[VELOCITY].tolist()))
+            speed = math.sqrt(sum(v * v for v in before[dynamics.VELOCITY].tolist()))
             for other in sorted(touching - self._touching):
                 name = self.body.names[other]
                 if name != FLOOR or speed > REST_SPEED_M_S:

@@ -16,24 +16,17 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.colour.profile import (
-    Appearance,
-    ImageFile,
-    Material,
-    SurfaceName,
-    Surfaces,
-    TextureName,
-)
+from airl_mav.addons.colour import profile
 from airl_mav.arena.geometry import Arena, Statics
 from airl_mav.core.streams import Stream, stream
 
 Floats = NDArray[np.float64]
 Rgb = tuple[int, int, int]
 
-TEXTURES: tuple[str, ...] = get_args(TextureName)
+TEXTURES: tuple[str, ...] = get_args(profile.TextureName)
 """Texture of each number in `Finish.texture`."""
 
-SURFACES: tuple[str, ...] = get_args(SurfaceName)
+SURFACES: tuple[str, ...] = get_args(profile.SurfaceName)
 """Reflection model of each number in `Finish.surface`."""
 
 FLOOR, WALLS, OBSTACLE = 0, 1, 2
@@ -65,7 +58,7 @@ class Finish:
     offset: Floats  # (m, 2) offset of the pattern in its periods, 0..1
     surface: NDArray[np.int8]  # (m,) number in SURFACES
     roughness: Floats  # (m,) `Material.roughness`
-    images: tuple[ImageFile, ...] = ()
+    images: tuple[profile.ImageFile, ...] = ()
 
     def colour(self, row: int) -> Rgb:
         """Return the sRGB 0-255 of a surface seen from far away: half of each albedo."""
@@ -148,7 +141,7 @@ def clear_of(arena: Arena) -> NDArray[np.bool_] | None:
 
 
 def draw_appearance(
-    appearance: Appearance,
+    appearance: profile.Appearance,
     seed: int,
     n_static: int,
     n_moving: int,
@@ -161,7 +154,7 @@ def draw_appearance(
     material of this name, 0-255; `statics` groups static primitives, None = each is separate.
     """
     draw = seed // appearance.period
-    kinds: list[tuple[_Part, Surfaces, int]] = [
+    kinds: list[tuple[_Part, profile.Surfaces, int]] = [
         (_Part.FLOOR, appearance.floor, 1),
         (_Part.WALLS, appearance.walls, 1),
         (_Part.STATIC, appearance.static, n_static if statics is None else len(statics.names)),
@@ -197,8 +190,8 @@ def draw_appearance(
 def _surfaces(
     rng: np.random.Generator,
     n: int,
-    kind: Surfaces,
-    appearance: Appearance,
+    kind: profile.Surfaces,
+    appearance: profile.Appearance,
     wall_colour: Rgb,
     statics: Statics | None,
 ) -> tuple[Floats, ...]:
@@ -242,14 +235,14 @@ def image_number(k: int) -> int:
     return len(TEXTURES) + 3 * k
 
 
-def _number(material: Material, appearance: Appearance) -> int:
+def _number(material: profile.Material, appearance: profile.Appearance) -> int:
     """Return the number of a material's texture."""
     if material.image is None:
         return TEXTURES.index(material.texture)
     return image_number(appearance.images.index(material.image))
 
 
-def _albedos(material: Material) -> Floats:
+def _albedos(material: profile.Material) -> Floats:
     """Return both albedos (2, 3), linear RGB. An image has the albedos of its black and white."""
     if material.image is not None:
         return np.stack([np.zeros(3), linear_of(np.array(material.albedo) / 255.0)])
@@ -257,7 +250,7 @@ def _albedos(material: Material) -> Floats:
     return linear_of(np.array([material.albedo, second]) / 255.0)
 
 
-def _light(appearance: Appearance, draw: int) -> Light:
+def _light(appearance: profile.Appearance, draw: int) -> Light:
     """Draw sun, sky and fog."""
     sun, sky = appearance.sun, appearance.sky
     rng = stream(draw, Stream.APPEARANCE, _Part.SUN)

@@ -25,16 +25,10 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress, new_console
+from airl_mav.profiles import projections
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.projections import (
-    UNDISTORTED,
-    Projection,
-    Renderer,
-    check_distortion,
-    check_fov,
-)
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_arenas import trust_arenas
@@ -118,7 +112,7 @@ class RenderOptions(ProfileModel):
         le=1000,
         default=0.0,
     )
-    renderer: Renderer = Field(
+    renderer: projections.Renderer = Field(
         default="raycast", description="renderer; mitsuba draws rgb only, without fog"
     )
     samples: int | None = quantity(
@@ -158,7 +152,7 @@ class RenderOptions(ProfileModel):
         "heading of the camera, clockwise from north", "deg", ge=-360, le=360, default=0.0
     )
     pitch_up_deg: float = quantity("how far the camera looks up", "deg", ge=-90, le=90, default=0.0)
-    projection: Projection = Field(default="pinhole", description="of the camera")
+    projection: projections.Projection = Field(default="pinhole", description="of the camera")
     width_px: int | None = quantity(
         "width; by default 960, of a film 384", "px", ge=8, le=4096, default=None
     )
@@ -169,7 +163,7 @@ class RenderOptions(ProfileModel):
         "horizontal field of view, less than 170 with a pinhole", "deg", gt=10, le=360, default=90.0
     )
     distortion: Coefficients = quantity(
-        "coefficients k1 k2 k3 k4 of a fisheye", "1", default=UNDISTORTED
+        "coefficients k1 k2 k3 k4 of a fisheye", "1", default=projections.UNDISTORTED
     )
     range_m: float = quantity(
         "depth at which --show depth is darkest", "m", gt=0.5, le=65, default=20.0
@@ -221,8 +215,10 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         if value != RenderOptions.model_fields[name].default:
             problem = "with --camera" if options.camera else "without --camera or --show flow"
             raise FieldError(name, value, problem=problem)
-    check_fov("fov_deg", options.projection, options.fov_deg)
-    check_distortion("distortion", options.projection, options.fov_deg, options.distortion)
+    projections.check_fov("fov_deg", options.projection, options.fov_deg)
+    projections.check_distortion(
+        "distortion", options.projection, options.fov_deg, options.distortion
+    )
     if options.out is not None and options.out.suffix.lower() == pictures.VIDEO:
         check_installed("film")
     if options.renderer == "mitsuba":

@@ -16,15 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.colour.appearance import (
-    FLOOR,
-    OBSTACLE,
-    TEXTURES,
-    WALLS,
-    Finish,
-    Light,
-    srgb_of,
-)
+from airl_mav.addons.colour import appearance
 from airl_mav.addons.colour.picture import grey
 from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.addons.colour.textures import mean_of, periods, texels
@@ -92,7 +84,7 @@ class PathTracer:
             light = self._rendered(mi, axes, position, whole, self._samples, seed)
         else:
             light = self._resampled(mi, k, axes, position, seed)
-        encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(light)).astype(np.uint8)
+        encoded: NDArray[np.uint8] = np.rint(255.0 * appearance.srgb_of(light)).astype(np.uint8)
         return encoded
 
     def _rendered(
@@ -162,7 +154,7 @@ def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) 
     }
 
 
-def _lights(mi: Any, light: Light) -> dict[str, Any]:
+def _lights(mi: Any, light: appearance.Light) -> dict[str, Any]:
     """Return sun and sky. A white surface reflects 1 / pi of its irradiance in each direction."""
     # Sine of each row's elevation; 0 below the horizon.
     sine = np.sin((0.5 - (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS) * math.pi).clip(0.0)
@@ -194,14 +186,14 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
     x, y, z = np.eye(3)
     made = [
         # Across is east, along (down in the pattern's image) is south.
-        _face(mi, finish, FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
+        _face(mi, finish, appearance.FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
         _ground(mi, finish),
     ]
     for side in (-1.0, 1.0):
         at = np.array([north + side * half_n, east, -half_h])
-        made.append(_face(mi, finish, WALLS, at, half_e * y, half_h * z))
+        made.append(_face(mi, finish, appearance.WALLS, at, half_e * y, half_h * z))
         at = np.array([north, east + side * half_e, -half_h])
-        made.append(_face(mi, finish, WALLS, at, half_n * x, half_h * z))
+        made.append(_face(mi, finish, appearance.WALLS, at, half_n * x, half_h * z))
     if b.ceiling:
         made.append(
             _ceiling(mi, arena.look.light, np.array([north, east, -b.height]), half_n, half_e)
@@ -209,11 +201,11 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
     if arena.ground is not None:
         made.append(_hills(mi, finish, arena.ground))
     for each in arena.meshes:
-        made.append(_mesh(mi, finish, OBSTACLE + each.first, each))
+        made.append(_mesh(mi, finish, appearance.OBSTACLE + each.first, each))
     for i in range(len(o)):
         if arena.mesh_of(i) is not None:
             continue
-        row, half, at = OBSTACLE + i, o.half_size[i], centers[i]
+        row, half, at = appearance.OBSTACLE + i, o.half_size[i], centers[i]
         if o.shape[i] == Shape.BOX:
             made += _box(mi, finish, row, at, half, float(o.yaw[i]))
         elif o.shape[i] == Shape.CYLINDER:
@@ -225,7 +217,7 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
 
 def _face(
     mi: Any,
-    finish: Finish,
+    finish: appearance.Finish,
     row: int,
     center: Floats,
     across: Floats,
@@ -246,7 +238,9 @@ def _face(
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": bsdf}
 
 
-def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float) -> dict[str, Any]:
+def _ceiling(
+    mi: Any, light: appearance.Light, center: Floats, half_n: float, half_e: float
+) -> dict[str, Any]:
     """Return a ceiling that emits light downwards and reflects nothing."""
     pose = np.diag([half_n, half_e, 1.0, 1.0])
     pose[:3, 3] = center
@@ -258,10 +252,10 @@ def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float
     }
 
 
-def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
+def _ground(mi: Any, finish: appearance.Finish) -> dict[str, Any]:
     """Return the ground beyond the walls, slightly below the floor, with its mean albedo."""
-    dark, bright = finish.albedo[FLOOR]
-    mean = dark + mean_of(finish, FLOOR) * (bright - dark)
+    dark, bright = finish.albedo[appearance.FLOOR]
+    mean = dark + mean_of(finish, appearance.FLOOR) * (bright - dark)
     pose = np.diag([RANGE_M, RANGE_M, 1.0, 1.0])
     # Down is positive, so the floor covers it.
     pose[2, 3] = 0.01
@@ -269,7 +263,7 @@ def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
 
 
 def _box(
-    mi: Any, finish: Finish, row: int, center: Floats, half: Floats, yaw: float
+    mi: Any, finish: appearance.Finish, row: int, center: Floats, half: Floats, yaw: float
 ) -> list[dict[str, Any]]:
     cos, sin = math.cos(yaw), math.sin(yaw)
     axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -283,7 +277,7 @@ def _box(
 
 
 def _cylinder(
-    mi: Any, finish: Finish, row: int, center: Floats, half: Floats
+    mi: Any, finish: appearance.Finish, row: int, center: Floats, half: Floats
 ) -> list[dict[str, Any]]:
     radius, height, per_m = float(half[0]), float(half[2]), _per_m(finish, row)
     begin = finish.offset[row]
@@ -307,28 +301,32 @@ def _cylinder(
     return [side, *caps]
 
 
-def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) -> dict[str, Any]:
+def _sphere(
+    mi: Any, finish: appearance.Finish, row: int, center: Floats, radius: float
+) -> dict[str, Any]:
     around, begin = _around(finish, row, radius), finish.offset[row]
     # The second texture coordinate runs from the pole at +z down to the opposite pole.
     bsdf = _material(mi, finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
     return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
 
 
-def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
+def _mesh(mi: Any, finish: appearance.Finish, row: int, placed: PlacedMesh) -> Any:
     """Return a mesh of flat triangles. Its pattern matches `surfaces.shade_meshes`."""
     vertices, faces = standing(placed)
     corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
     return _triangles(mi, finish, row, corners, vertices[faces])
 
 
-def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
+def _hills(mi: Any, finish: appearance.Finish, ground: Ground) -> Any:
     """Return hills with the floor's pattern: across is east, along is south."""
     corners = ground.points[ground.faces]
     own = corners[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
-    return _triangles(mi, finish, FLOOR, own, corners)
+    return _triangles(mi, finish, appearance.FLOOR, own, corners)
 
 
-def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Floats) -> Any:
+def _triangles(
+    mi: Any, finish: appearance.Finish, row: int, corners: Floats, placed: Floats
+) -> Any:
     """Return flat triangles with a pattern as in `surfaces.shade_meshes`.
 
     `corners` (m, 3, 3) are along the mesh's axes, `placed` (m, 3, 3) NED [m]; `row` is the
@@ -354,12 +352,12 @@ def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Float
     return mesh
 
 
-def _per_m(finish: Finish, row: int) -> float:
+def _per_m(finish: appearance.Finish, row: int) -> float:
     """Return the periods of a pattern per metre."""
     return 1.0 / float((finish.size_m * periods(finish))[row])
 
 
-def _around(finish: Finish, row: int, radius: float) -> float:
+def _around(finish: appearance.Finish, row: int, radius: float) -> float:
     """Return the periods of a pattern around a body."""
     return max(round(2.0 * math.pi * radius * _per_m(finish, row)), 1.0)
 
@@ -376,7 +374,7 @@ def _two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": bsdf}
 
 
-def _reflecting(finish: Finish, row: int, albedo: dict[str, Any]) -> dict[str, Any]:
+def _reflecting(finish: appearance.Finish, row: int, albedo: dict[str, Any]) -> dict[str, Any]:
     """Return a material with an albedo, optionally a texture; optical model as in `gloss`."""
     surface, alpha = finish.surface[row], float(finish.roughness[row] ** 2)
     if surface == GLASS:
@@ -396,14 +394,14 @@ def _reflecting(finish: Finish, row: int, albedo: dict[str, Any]) -> dict[str, A
 
 def _material(
     mi: Any,
-    finish: Finish,
+    finish: appearance.Finish,
     row: int,
     size: tuple[float, float],
     start: tuple[float, float],
 ) -> dict[str, Any]:
     """Return a material with a pattern from `start` over `size`, both in periods."""
     dark, bright = finish.albedo[row]
-    if TEXTURES.index("plain") == finish.texture[row]:
+    if appearance.TEXTURES.index("plain") == finish.texture[row]:
         return _reflecting(finish, row, _rgb(dark))
     mixed = (dark + texels(finish, row) * (bright - dark)).astype(np.float32)
     place = np.eye(4)

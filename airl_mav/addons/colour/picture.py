@@ -12,25 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.colour import surfaces
+from airl_mav.addons.colour import shading, surfaces
 from airl_mav.addons.colour.appearance import FLOOR as FLOOR_ROW
 from airl_mav.addons.colour.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.addons.colour.appearance import WALLS as WALLS_ROW
 from airl_mav.addons.colour.appearance import Drawn, linear_of, srgb_of
 from airl_mav.addons.colour.reflections import draw_reflections
-from airl_mav.addons.colour.shading import (
-    F32,
-    ZERO,
-    Canvas,
-    Gloss,
-    Lit,
-    Packed,
-    PixelRays,
-    Plane,
-    Points,
-    SceneLook,
-    let_through,
-)
 from airl_mav.addons.colour.shadows import (
     CORNERS,
     Shaded,
@@ -40,19 +27,12 @@ from airl_mav.addons.colour.shadows import (
 )
 from airl_mav.addons.colour.textures import atlas, mean_of, periods
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera import raycast
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, meshes_of, raised
 from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.meshes import Faces
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, LensConstants, Optics, Scene, lens_of
-from airl_mav.camera.raycast import (
-    aim,
-    blank,
-    body_of,
-    draw_bodies,
-    invert,
-    write_transposed,
-)
 from airl_mav.camera.render import RANGE_M, pose_of, scene_of
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec
@@ -77,7 +57,7 @@ class ColourArrays(NamedTuple):
     per_m: NDArray[np.float32]  # (m,) periods of the pattern per metre [1/m]
     offset: NDArray[np.float32]  # (m, 2)
     albedo: NDArray[np.float32]  # (m, 2, 3)
-    gloss: Gloss | None
+    gloss: shading.Gloss | None
     """Properties of surfaces that are not matt; None = all are matt, at no cost."""
     lights: NDArray[np.float32]
     """(7, 3) direction of the sun, irradiance of sun and sky, the floor's mean radiosity, zenith,
@@ -102,7 +82,7 @@ class ColourArrays(NamedTuple):
             (1.0 / (finish.size_m * periods(finish))).astype(np.float32),
             finish.offset.astype(np.float32),
             finish.albedo.astype(np.float32),
-            Gloss.of(finish),
+            shading.Gloss.of(finish),
             np.array(lights, np.float32),
         )
 
@@ -201,13 +181,13 @@ class Work(NamedTuple):
 
     lines: NDArray[np.float64]  # (n, 2)
     xs: NDArray[np.float64]  # (m,)
-    far: Plane  # (n, m)
+    far: shading.Plane  # (n, m)
     ids: Ids  # (n, m)
-    lit: Plane  # (n, m)
-    clear: Plane  # (n, m)
-    out: Packed  # (n m,)
-    rays: PixelRays
-    points: Points
+    lit: shading.Plane  # (n, m)
+    clear: shading.Plane  # (n, m)
+    out: shading.Packed  # (n m,)
+    rays: shading.PixelRays
+    points: shading.Points
     corners: NDArray[np.float64]  # (CORNERS, 3)
 
     @classmethod
@@ -217,7 +197,7 @@ class Work(NamedTuple):
         # A block has at least one whole line.
         block = max(surfaces.BLOCK, m)
 
-        def floats(*shape: int) -> Plane:
+        def floats(*shape: int) -> shading.Plane:
             return np.zeros(shape, np.float32)
 
         return cls(
@@ -228,8 +208,8 @@ class Work(NamedTuple):
             floats(n, m),
             floats(n, m),
             np.zeros(n * m, np.int32),
-            PixelRays(floats(n * m), floats(n * m), floats(n * m)),
-            Points(np.zeros(block, np.int32), *(floats(block) for _ in range(5))),
+            shading.PixelRays(floats(n * m), floats(n * m), floats(n * m)),
+            shading.Points(np.zeros(block, np.int32), *(floats(block) for _ in range(5))),
             np.zeros((CORNERS, 3)),
         )
 
@@ -237,7 +217,7 @@ class Work(NamedTuple):
 @large_kernel
 def render_colour(
     rgb: NDArray[np.uint8],
-    depth: Plane,
+    depth: shading.Plane,
     seen: Ids,
     work: Work,
     position: Vec | NDArray[np.float64],
@@ -246,7 +226,7 @@ def render_colour(
     scene: Scene,
     meshes: Meshes | None,
     colours: ColourArrays,
-    atlas: Plane,
+    atlas: shading.Plane,
 ) -> None:
     """Render the colour image of an arena; arguments not listed as in `render_depth`.
 
@@ -257,45 +237,45 @@ def render_colour(
     """
     camera = raised(meshes, position)
     lines, xs, bent, cylindrical = work.lines, work.xs, lens.bent, lens.cylindrical
-    view, axes = aim(lines, xs, quaternion, lens)
+    view, axes = raycast.aim(lines, xs, quaternion, lens)
     # A cylinder is drawn by columns into work buffers, and transposed at the end.
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
     rectangles = np.zeros((len(scene.shape) + count_of(meshes), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
     optics = Optics(lines, xs, bent, view, axes, camera)
-    inside = draw_bodies(far, ids, rectangles, optics, scene, meshes, faces)
+    inside = raycast.draw_bodies(far, ids, rectangles, optics, scene, meshes, faces)
     if inside >= 0:
         _show_inside(rgb, depth, seen, inside, bent)
         return
-    invert(far)
-    pixel2 = F32(1.0 / (view.focal * view.focal))
+    raycast.invert(far)
+    pixel2 = shading.F32(1.0 / (view.focal * view.focal))
     c, light = colours, _lit(colours.lights)
-    look = SceneLook(c.texture, c.per_m, c.offset, c.albedo, c.gloss, light, atlas, pixel2)  # type: ignore[arg-type]
+    look = shading.SceneLook(c.texture, c.per_m, c.offset, c.albedo, c.gloss, light, atlas, pixel2)  # type: ignore[arg-type]
     _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, c.gloss)
     if cylindrical:
-        write_transposed(depth, far)
-        write_transposed(seen, ids)
+        raycast.write_transposed(depth, far)
+        raycast.write_transposed(seen, ids)
 
 
 @borrowing_kernel
 def _show_inside(
-    rgb: NDArray[np.uint8], depth: Plane, seen: Ids, inside: int, bent: Bent | None
+    rgb: NDArray[np.uint8], depth: shading.Plane, seen: Ids, inside: int, bent: Bent | None
 ) -> None:
     """Write the image of a camera inside an obstacle."""
     rgb[:, :, :] = 0
     depth[:, :] = MIN_DEPTH_M
     seen[:, :] = OBSTACLE + inside
     if bent is not None:
-        blank(depth, bent)
+        raycast.blank(depth, bent)
         for v in range(depth.shape[0]):
             for u in range(depth.shape[1]):
-                seen[v, u] = seen[v, u] if depth[v, u] > ZERO else SKY
+                seen[v, u] = seen[v, u] if depth[v, u] > shading.ZERO else SKY
 
 
 @borrowing_kernel
 def _show(
     rgb: NDArray[np.uint8],
-    far: Plane,
+    far: shading.Plane,
     ids: Ids,
     rectangles: Rectangles,
     faces: Faces | None,
@@ -303,8 +283,8 @@ def _show(
     optics: Optics,
     scene: Scene,
     meshes: Meshes | None,
-    look: SceneLook,
-    gloss: Gloss | None,
+    look: shading.SceneLook,
+    gloss: shading.Gloss | None,
 ) -> None:
     """Write the colours of the bodies drawn by `draw_bodies`.
 
@@ -314,24 +294,31 @@ def _show(
     """
     camera, view, light, count = optics.camera, optics.lens, look.light, ids.size
     lit, out, rays = work.lit, work.out, work.rays
-    canvas = Canvas(
+    canvas = shading.Canvas(
         out, ids.reshape(count), far.reshape(count), lit.reshape(count),
         work.clear.reshape(count), rays, work.points,
     )  # fmt: skip
     surfaces.write_rays(rays, optics)
     to_sun = (float(light.to_sun[0]), float(light.to_sun[1]), float(light.to_sun[2]))
     shade_by_walls(
-        canvas, camera, scene.bounds, to_sun, float(light.extinction), let_through(gloss, WALLS_ROW)
+        canvas,
+        camera,
+        scene.bounds,
+        to_sun,
+        float(light.extinction),
+        shading.let_through(gloss, WALLS_ROW),
     )
     shadows = Shaded(lit, far, ids, work.corners)
     # Without sunlight `lit` has no effect, so bodies need no shadows.
-    sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
+    sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > shading.ZERO
     for i in range(len(scene.shape)):
         if sunny:
             if is_owned(meshes, i):
                 continue
-            body = body_of(scene, optics.axes, camera, i)
-            shade_by_obstacle(shadows, optics, body, to_sun, let_through(gloss, OBSTACLE_ROW + i))
+            body = raycast.body_of(scene, optics.axes, camera, i)
+            shade_by_obstacle(
+                shadows, optics, body, to_sun, shading.let_through(gloss, OBSTACLE_ROW + i)
+            )
     if meshes is not None and faces is not None and sunny:
         shade_by_meshes(shadows, optics, meshes, faces, to_sun, gloss)
     surfaces.draw_sky(canvas, camera, light)
@@ -342,7 +329,7 @@ def _show(
     for i in range(len(scene.shape)):
         if is_owned(meshes, i):
             continue
-        body = body_of(scene, optics.axes, camera, i)
+        body = raycast.body_of(scene, optics.axes, camera, i)
         # A cylinder may show a body at three turns, as in `raycast._draw_obstacle`.
         for k in range(3 if view.cylindrical else 1):
             surfaces.shade_obstacle(canvas, look, optics, body, rectangles[i, k])
@@ -364,7 +351,7 @@ def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
 
 
 @borrowing_kernel
-def _blacken(out: Packed, bent: Bent | None) -> None:
+def _blacken(out: shading.Packed, bent: Bent | None) -> None:
     """Write black into fisheye pixels outside the field of view."""
     if bent is None:
         return
@@ -377,9 +364,9 @@ def _blacken(out: Packed, bent: Bent | None) -> None:
 
 
 @borrowing_kernel
-def _lit(lights: NDArray[np.float32]) -> Lit:
+def _lit(lights: NDArray[np.float32]) -> shading.Lit:
     """Return the light from its array."""
-    return Lit(
+    return shading.Lit(
         (lights[0, 0], lights[0, 1], lights[0, 2]),
         (lights[1, 0], lights[1, 1], lights[1, 2]),
         (lights[2, 0], lights[2, 1], lights[2, 2]),
@@ -391,7 +378,7 @@ def _lit(lights: NDArray[np.float32]) -> Lit:
 
 
 @borrowing_kernel
-def unpack(rgb: NDArray[np.uint8], out: Packed, cylindrical: bool) -> None:
+def unpack(rgb: NDArray[np.uint8], out: shading.Packed, cylindrical: bool) -> None:
     """Write the image from its packed pixels, line by line."""
     height, width, _ = rgb.shape
     if cylindrical:

@@ -25,21 +25,9 @@ from airl_mav.addons.colour.appearance import WALLS as WALLS_ROW
 from airl_mav.addons.colour.shading import material_row
 from airl_mav.addons.colour.shadows import ABOVE_M
 from airl_mav.addons.colour.surfaces import FOG_LAYER_M
+from airl_mav.camera import primitives
 from airl_mav.camera.bvh import STACK, Meshes, is_owned
 from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by
-from airl_mav.camera.primitives import (
-    BOX,
-    CEILING,
-    CYLINDER,
-    FLOOR,
-    GROUND,
-    OBSTACLE,
-    SKY,
-    WALL_EAST_WEST,
-    WALL_NORTH_SOUTH,
-    Ids,
-    turn_axes,
-)
 from airl_mav.camera.projection import Scene, dot
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
@@ -83,7 +71,7 @@ class RayHit(NamedTuple):
 @large_kernel
 def draw_reflections(
     out: shading.Packed,
-    ids: Ids,
+    ids: primitives.Ids,
     rays: shading.PixelRays,
     camera: Vec,
     scene: Scene,
@@ -100,7 +88,10 @@ def draw_reflections(
     for u in range(len(out)):
         seen = ids[u]
         # Sky and ceiling have no material.
-        if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == shading.MATT:
+        if (
+            seen in (primitives.SKY, primitives.CEILING)
+            or look.gloss.surface[row_of(seen)] == shading.MATT
+        ):
             continue
         n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
         per = 1.0 / math.sqrt(n * n + e * e + d * d)
@@ -181,7 +172,7 @@ def _follow(
         share = (tree[tops, 6], tree[tops, 7], tree[tops, 8])
         way, depth, blur = tree[tops, 9], int(tree[tops, 10]), tree[tops, 11]
         met = meet(bodies, meshes, origin, ray, nodes)
-        if met.seen == SKY:
+        if met.seen == primitives.SKY:
             _add(colour, share, sky_at(light, ray, origin[2]), 1.0)
             continue
         # Beer's law: fog adds the horizon's light and attenuates the rest.
@@ -189,7 +180,7 @@ def _follow(
             clear = math.exp(-float(light.extinction) * met.distance)
             _add(colour, share, light.horizon, 1.0 - clear)
             share = _scaled(share, clear)
-        if met.seen == CEILING:
+        if met.seen == primitives.CEILING:
             _add(colour, share, light.zenith, 1.0)
             continue
         row = row_of(met.seen)
@@ -302,9 +293,9 @@ def _mirror(tree: NDArray[np.float64], tops: int, seen: RayHit, kind: int) -> in
 @kernel
 def row_of(seen: int) -> int:
     """Return the row of `Finish` for a segmentation number, neither ceiling nor sky."""
-    if seen >= OBSTACLE:
-        return OBSTACLE_ROW + seen - OBSTACLE
-    return FLOOR_ROW if seen in (FLOOR, GROUND) else WALLS_ROW
+    if seen >= primitives.OBSTACLE:
+        return OBSTACLE_ROW + seen - primitives.OBSTACLE
+    return FLOOR_ROW if seen in (primitives.FLOOR, primitives.GROUND) else WALLS_ROW
 
 
 @large_borrowing_kernel
@@ -328,20 +319,20 @@ def albedo_at(
         if meshes is not None:
             n = meshes.bvh.normals[met.face]
             across, along = shading.on_triangle(a, b, c, n[0], n[1], n[2])
-    elif met.seen == FLOOR:
+    elif met.seen == primitives.FLOOR:
         across, along = b, -a
-    elif met.seen < OBSTACLE:
-        across, along = (b if met.seen == WALL_NORTH_SOUTH else a), c
+    elif met.seen < primitives.OBSTACLE:
+        across, along = (b if met.seen == primitives.WALL_NORTH_SOUTH else a), c
     else:
         shape, radius = (
-            bodies.shape[met.seen - OBSTACLE],
-            bodies.half_size[met.seen - OBSTACLE, 0],
+            bodies.shape[met.seen - primitives.OBSTACLE],
+            bodies.half_size[met.seen - primitives.OBSTACLE, 0],
         )
-        if shape == BOX:
+        if shape == primitives.BOX:
             across, along = shading.on_box(a, b, c, place.side == 2, place.side == 0)
         else:
             per_turn, in_periods = shading.periods_around(radius, per_m), True
-            if shape == CYLINDER:
+            if shape == primitives.CYLINDER:
                 across, along = shading.on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
             else:
                 across, along = shading.on_sphere(a, b, c, per_turn)
@@ -430,11 +421,11 @@ def bodies_of(scene: Scene) -> Bodies:
     for i in range(n):
         turn[i, 0], turn[i, 1] = 1.0, 0.0
         a, b, c = half_size[i, 0], half_size[i, 1], half_size[i, 2]
-        if shape[i] == BOX:
+        if shape[i] == primitives.BOX:
             turn[i, 0], turn[i, 1] = math.cos(yaw[i]), math.sin(yaw[i])
             reach[i] = a * a + b * b + c * c
         else:
-            reach[i] = a * a + c * c if shape[i] == CYLINDER else a * a
+            reach[i] = a * a + c * c if shape[i] == primitives.CYLINDER else a * a
     return Bodies(bounds, shape, center, half_size, turn, reach)
 
 
@@ -458,13 +449,13 @@ def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
     if apart > 0.0 and (ahead > 0.0 or ahead * ahead < apart):
         return math.inf, -math.inf
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
-    o, d = turn_axes(away, cos, sin), turn_axes(ray, cos, sin)
-    if bodies.shape[i] == BOX:
+    o, d = primitives.turn_axes(away, cos, sin), primitives.turn_axes(ray, cos, sin)
+    if bodies.shape[i] == primitives.BOX:
         i0, i1, i2 = inverse_of(d[0]), inverse_of(d[1]), inverse_of(d[2])
         a, b, c = -o[0] * i0, -o[1] * i1, -o[2] * i2
         w0, w1, w2 = half[0] * abs(i0), half[1] * abs(i1), half[2] * abs(i2)
         return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
-    if bodies.shape[i] == CYLINDER:
+    if bodies.shape[i] == primitives.CYLINDER:
         level = max(d[0] * d[0] + d[1] * d[1], 1e-18)
         toward = -(o[0] * d[0] + o[1] * d[1])
         rest = level * (half[0] * half[0] - o[0] * o[0] - o[1] * o[1]) + toward * toward
@@ -484,7 +475,7 @@ def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
 @borrowing_kernel
 def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, int]:
     """Return a ray's first hit of floor, walls and ceiling: distance and number."""
-    best, seen = math.inf, SKY
+    best, seen = math.inf, primitives.SKY
     for side in range(4):
         axis = side // 2
         t = (bounds[side] - origin[axis]) * inverse_of(ray[axis])
@@ -494,14 +485,14 @@ def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, in
         other = 1 - axis
         inside = bounds[2 * other] <= p[other] <= bounds[2 * other + 1]
         if inside and -bounds[4] <= p[2] <= 0.0:
-            best, seen = t, WALL_NORTH_SOUTH if axis == 0 else WALL_EAST_WEST
+            best, seen = t, primitives.WALL_NORTH_SOUTH if axis == 0 else primitives.WALL_EAST_WEST
     for lid in range(2 if bounds[5] > 0.0 else 1):
         t = ((-bounds[4] if lid else 0.0) - origin[2]) * inverse_of(ray[2])
         if t <= LEAST_M or t >= best:
             continue
         p = advanced(origin, ray, t)
         if bounds[0] <= p[0] <= bounds[1] and bounds[2] <= p[1] <= bounds[3]:
-            best, seen = t, CEILING if lid else FLOOR
+            best, seen = t, primitives.CEILING if lid else primitives.FLOOR
     return best, seen
 
 
@@ -514,7 +505,7 @@ def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]
         per * (origin[1] - meshes.pose[k, 1]),
         per * (origin[2] - meshes.pose[k, 5]),
     )
-    return turn_axes(offset, cos, sin), turn_axes(ray, cos, sin)
+    return primitives.turn_axes(offset, cos, sin), primitives.turn_axes(ray, cos, sin)
 
 
 @large_borrowing_kernel
@@ -533,7 +524,7 @@ def meet(
         # A ray that starts inside a body, as in glass, hits the far side.
         t = enter if enter > LEAST_M else leave
         if LEAST_M < t < best:
-            best, seen = t, OBSTACLE + i
+            best, seen = t, primitives.OBSTACLE + i
     if meshes is not None:
         for k in range(len(meshes.root)):
             scale = meshes.pose[k, 4]
@@ -542,7 +533,7 @@ def meet(
                 meshes.bvh, meshes.root[k], at, way, LEAST_M / scale, best / scale, waiting
             )
             if which >= 0:
-                best, seen, mesh, face = t * scale, OBSTACLE + meshes.first[k], k, which
+                best, seen, mesh, face = t * scale, primitives.OBSTACLE + meshes.first[k], k, which
     return Met(best, seen, mesh, face)
 
 
@@ -554,9 +545,11 @@ def place_of(
     p = advanced(origin, ray, met.distance)
     if meshes is not None and met.mesh >= 0:
         return _on_mesh(meshes, met, p, ray)
-    if met.seen >= OBSTACLE:
-        return _on_obstacle(bodies, met.seen - OBSTACLE, p, ray)
-    axis = 2 if met.seen == FLOOR else (0 if met.seen == WALL_NORTH_SOUTH else 1)
+    if met.seen >= primitives.OBSTACLE:
+        return _on_obstacle(bodies, met.seen - primitives.OBSTACLE, p, ray)
+    axis = (
+        2 if met.seen == primitives.FLOOR else (0 if met.seen == primitives.WALL_NORTH_SOUTH else 1)
+    )
     sign = -1.0 if ray[axis] > 0.0 else 1.0
     return SurfacePoint(p, _scaled_axis(axis, sign), axis)
 
@@ -584,7 +577,7 @@ def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> SurfacePoint:
     k, n = met.mesh, meshes.bvh.normals[met.face]
     scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
     at, _ = _from_mesh(meshes, k, p, ray)
-    normal = turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
+    normal = primitives.turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
     return SurfacePoint((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
 
 
@@ -593,23 +586,23 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> SurfacePoint:
     """Return the point p on obstacle i, with its normal."""
     center, half = bodies.center[i], bodies.half_size[i]
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
-    a, b, c = turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
+    a, b, c = primitives.turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
     side = 3
-    if bodies.shape[i] == BOX:
+    if bodies.shape[i] == primitives.BOX:
         # The face has the largest coordinate relative to the half size.
         qa, qb, qc = abs(a) / half[0], abs(b) / half[1], abs(c) / half[2]
         side = 2 if qc >= max(qa, qb) else (0 if qa >= qb else 1)
         outward = c if side == 2 else (a if side == 0 else b)
         normal = _scaled_axis(side, math.copysign(1.0, outward))
-    elif bodies.shape[i] == CYLINDER and abs(c) / half[2] * half[0] >= math.hypot(a, b):
+    elif bodies.shape[i] == primitives.CYLINDER and abs(c) / half[2] * half[0] >= math.hypot(a, b):
         side = 2
         normal = _scaled_axis(side, math.copysign(1.0, c))
     else:
-        height = 0.0 if bodies.shape[i] == CYLINDER else c
+        height = 0.0 if bodies.shape[i] == primitives.CYLINDER else c
         per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
         normal = (per * a, per * b, per * height)
     # Inside glass the far side is visible from within.
-    return SurfacePoint((a, b, c), _towards(turn_axes(normal, cos, -sin), ray), side)
+    return SurfacePoint((a, b, c), _towards(primitives.turn_axes(normal, cos, -sin), ray), side)
 
 
 @large_borrowing_kernel
@@ -643,7 +636,7 @@ def sunlight(
         # An opaque body ends the search.
         if share == 0.0:
             return 0.0
-        if is_owned(meshes, i) or own == OBSTACLE + i:
+        if is_owned(meshes, i) or own == primitives.OBSTACLE + i:
             continue
         enter, leave = _span(bodies, i, at, to_sun)
         if leave >= max(enter, 0.0):

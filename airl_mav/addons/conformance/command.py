@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.conformance import flight_checks
+from airl_mav.addons.conformance import flight_checks, telemetry
 from airl_mav.addons.conformance.checklist import (
     CheckFailedError,
     Checklist,
@@ -29,18 +29,6 @@ from airl_mav.addons.conformance.result import (
     load_reference,
     step_table,
     summary,
-)
-from airl_mav.addons.conformance.telemetry import (
-    BEFORE_S,
-    MANOEUVRES,
-    STEP_NAMES,
-    STOP_NED,
-    HeldSetpoint,
-    MeasuredStep,
-    StepName,
-    StepResponse,
-    measure,
-    plan,
 )
 from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
 from airl_mav.core.child_process import terminated_as_interrupted
@@ -139,7 +127,7 @@ def check_conformance(
         result.heartbeat = vehicle.telemetry.latest("HEARTBEAT")
         result.autopilot_version = vehicle.telemetry.latest("AUTOPILOT_VERSION")
     if result.reference is not None and result.steps:
-        for name in STEP_NAMES:
+        for name in telemetry.STEP_NAMES:
             if name in asked.flown_steps:
                 found, stored = result.steps.get(name), result.reference
                 checklist.perform(f"step {name}", partial(judge, found, stored))
@@ -187,27 +175,31 @@ def _check_in_air(
 def _fly_steps(
     vehicle: VehicleConnection,
     settings: ConformanceSettings,
-    measured: dict[StepName, MeasuredStep],
+    measured: dict[telemetry.StepName, telemetry.MeasuredStep],
 ) -> str:
     """Fly the steps and add their responses. Raises CheckFailedError, LinkError."""
-    steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
-    flight_checks.start_offboard(vehicle, STOP_NED)
+    steps = {leg.step.name: leg.step for legs in telemetry.MANOEUVRES for leg in legs if leg.step}
+    flight_checks.start_offboard(vehicle, telemetry.STOP_NED)
     vehicle.wait(FACE_NORTH_S)
     inexact = vehicle.clock.inexact
     for repetition in range(settings.repeat):
-        for leg in plan(settings.flown_steps, mirrored=repetition % 2 == 1):
+        for leg in telemetry.plan(settings.flown_steps, mirrored=repetition % 2 == 1):
             response = _fly_leg(vehicle, leg)
             if leg.step is not None and response is not None:
                 name = leg.step.name
                 vehicle.transcript.add("note", f"{name}: {summary(response)}")
-                measured.setdefault(name, MeasuredStep(steps[name], [])).flights.append(response)
+                measured.setdefault(name, telemetry.MeasuredStep(steps[name], [])).flights.append(
+                    response
+                )
     inexact = vehicle.clock.inexact - inexact
     finding = f"{sum(len(each.flights) for each in measured.values())} steps"
     finding += f", timed by {vehicle.clock.method.value}"
     return finding + (f", {inexact} setpoints only by the newest telemetry" if inexact else "")
 
 
-def _fly_leg(vehicle: VehicleConnection, leg: HeldSetpoint) -> StepResponse | None:
+def _fly_leg(
+    vehicle: VehicleConnection, leg: telemetry.HeldSetpoint
+) -> telemetry.StepResponse | None:
     """Hold a setpoint for its duration; return the response to its step."""
     sent_s = vehicle.fly(leg.setpoint)
     vehicle.wait(leg.seconds - (vehicle.telemetry.boot_s - sent_s))
@@ -215,10 +207,10 @@ def _fly_leg(vehicle: VehicleConnection, leg: HeldSetpoint) -> StepResponse | No
     require(offboard, f"it left offboard: {vehicle.mode_name}")
     if leg.step is None:
         return None
-    motion = vehicle.telemetry.recent(leg.seconds + 2.0 * BEFORE_S)
+    motion = vehicle.telemetry.recent(leg.seconds + 2.0 * telemetry.BEFORE_S)
     try:
-        motion = motion.between(sent_s - BEFORE_S, sent_s + leg.seconds)
-        return measure(leg.step, motion, sent_s)
+        motion = motion.between(sent_s - telemetry.BEFORE_S, sent_s + leg.seconds)
+        return telemetry.measure(leg.step, motion, sent_s)
     except ValueError as error:
         raise CheckFailedError(f"{leg.step.name}: {error}") from None
 

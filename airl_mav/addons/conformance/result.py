@@ -12,20 +12,7 @@ from pydantic import BaseModel, Field
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.addons.conformance.checklist import (
-    CheckFailedError,
-    CheckOutcome,
-    ConformanceCheck,
-    TranscriptLine,
-    require,
-)
-from airl_mav.addons.conformance.telemetry import (
-    STEP_NAMES,
-    Fields,
-    MeasuredStep,
-    StepName,
-    StepResponse,
-)
+from airl_mav.addons.conformance import checklist, telemetry
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import ProfileModel, quantity
@@ -72,7 +59,7 @@ class Reference(ProfileModel):
     streams_hz: Mapping[str, float] = Field(
         description="messages that a fresh UDP link carries unasked [Hz]"
     )
-    steps: Mapping[StepName, StoredStep] = Field(description="step responses")
+    steps: Mapping[telemetry.StepName, StoredStep] = Field(description="step responses")
 
 
 class Deviation(NamedTuple):
@@ -95,7 +82,9 @@ class Deviation(NamedTuple):
         )
 
 
-def deviations(measured: StepResponse, stored: StoredStep, tolerance: Tolerance) -> list[Deviation]:
+def deviations(
+    measured: telemetry.StepResponse, stored: StoredStep, tolerance: Tolerance
+) -> list[Deviation]:
     """Return the deviations of latency, rise time and overshoot; NaN always deviates."""
     floor_s = tolerance.floor_s
     found = []
@@ -116,7 +105,7 @@ def deviations(measured: StepResponse, stored: StoredStep, tolerance: Tolerance)
     return found
 
 
-def summary(response: StepResponse) -> str:
+def summary(response: telemetry.StepResponse) -> str:
     """Return the judged figures in one line."""
     return (
         f"latency {1e3 * response.latency_s:.0f} ms, rise {1e3 * response.rise_s:.0f} ms, "
@@ -124,15 +113,15 @@ def summary(response: StepResponse) -> str:
     )
 
 
-def judge(measured: MeasuredStep | None, reference: Reference) -> str:
+def judge(measured: telemetry.MeasuredStep | None, reference: Reference) -> str:
     """Return the finding of a step. Raises CheckFailedError if missing or deviating."""
     if measured is None:
-        raise CheckFailedError("not flown")
+        raise checklist.CheckFailedError("not flown")
     stored = reference.steps.get(measured.step.name)
     if stored is None:
-        raise CheckFailedError(f"nothing stored for {reference.title}")
+        raise checklist.CheckFailedError(f"nothing stored for {reference.title}")
     found = deviations(measured.median, stored, reference.tolerance)
-    require(not found, "; ".join(map(str, found)))
+    checklist.require(not found, "; ".join(map(str, found)))
     return summary(measured.median)
 
 
@@ -197,7 +186,7 @@ class ConformanceSettings(BaseModel):
     @property
     def flown_steps(self) -> tuple[str, ...]:
         """Names of the steps to fly."""
-        return STEP_NAMES if self.steps is None else self.steps
+        return telemetry.STEP_NAMES if self.steps is None else self.steps
 
     def check(self) -> None:
         """Raise UsageError if a value is out of range."""
@@ -210,8 +199,8 @@ class ConformanceSettings(BaseModel):
             if not low <= (value := getattr(self, name)) <= high:
                 raise FieldError(name, value, f"{low:g} <= value <= {high:g}")
         for step in self.flown_steps:
-            if step not in STEP_NAMES:
-                raise FieldError("steps", step, ", ".join(STEP_NAMES))
+            if step not in telemetry.STEP_NAMES:
+                raise FieldError("steps", step, ", ".join(telemetry.STEP_NAMES))
         if self.reference != AUTO:
             load_reference(self.reference, 0)
 
@@ -221,14 +210,14 @@ class ConformanceResult:
     """Results of a complete or interrupted run."""
 
     settings: ConformanceSettings
-    checks: list[ConformanceCheck] = field(default_factory=list)
-    transcript: list[TranscriptLine] = field(default_factory=list)
-    steps: dict[StepName, MeasuredStep] = field(default_factory=dict)
+    checks: list[checklist.ConformanceCheck] = field(default_factory=list)
+    transcript: list[checklist.TranscriptLine] = field(default_factory=list)
+    steps: dict[telemetry.StepName, telemetry.MeasuredStep] = field(default_factory=dict)
     """Step responses, by step name."""
     reference: Reference | None = None
     """Stored column; None before the autopilot is known."""
-    heartbeat: Fields | None = None
-    autopilot_version: Fields | None = None
+    heartbeat: telemetry.Fields | None = None
+    autopilot_version: telemetry.Fields | None = None
     interrupted: bool = False
     known_to_be_down: bool = True
     """True if the vehicle is known to be disarmed at the end."""
@@ -236,14 +225,16 @@ class ConformanceResult:
     @property
     def passed(self) -> bool:
         """True if checks were made and all passed."""
-        failed = any(check.outcome is CheckOutcome.FAILED for check in self.checks)
+        failed = any(check.outcome is checklist.CheckOutcome.FAILED for check in self.checks)
         return bool(self.checks) and not failed and not self.interrupted
 
     @property
     def verdict(self) -> str:
         """Outcome in one line."""
-        failed = [check.name for check in self.checks if check.outcome is CheckOutcome.FAILED]
-        passed = sum(check.outcome is CheckOutcome.PASSED for check in self.checks)
+        failed = [
+            check.name for check in self.checks if check.outcome is checklist.CheckOutcome.FAILED
+        ]
+        passed = sum(check.outcome is checklist.CheckOutcome.PASSED for check in self.checks)
         rest = len(self.checks) - passed - len(failed)
         counted = f"{passed} passed, {len(failed)} failed, {rest} not applicable"
         down = "" if self.known_to_be_down else "; NOT known to be down"
@@ -294,7 +285,7 @@ class ConformanceResult:
             write_json(path, self.as_data())
 
 
-def _without_nan(response: StepResponse) -> dict[str, float | None]:
+def _without_nan(response: telemetry.StepResponse) -> dict[str, float | None]:
     """Return the figures with None for NaN, which JSON does not support."""
     return {
         name: None if math.isnan(value) else value for name, value in response._asdict().items()
@@ -314,13 +305,13 @@ FIGURES: dict[str, tuple[str, float, int]] = {
 
 LINE_MARKS = {"sent": ("->", "cyan"), "heard": ("<-", ""), "check": ("==", "bold")}
 COLOURS = {
-    CheckOutcome.PASSED: "green",
-    CheckOutcome.FAILED: "red",
-    CheckOutcome.NOT_APPLICABLE: "yellow",
+    checklist.CheckOutcome.PASSED: "green",
+    checklist.CheckOutcome.FAILED: "red",
+    checklist.CheckOutcome.NOT_APPLICABLE: "yellow",
 }
 
 
-def line_text(line: TranscriptLine) -> Text:
+def line_text(line: checklist.TranscriptLine) -> Text:
     """Return a formatted line of the transcript."""
     mark, style = LINE_MARKS.get(line.kind, ("--", "dim"))
     return Text(f"{line.time_s:9.3f} {mark} {line.text}", style=style)
@@ -338,7 +329,7 @@ def step_table(result: ConformanceResult, reference: Reference) -> Table:
     table.add_column("")
     for heading, _, _ in FIGURES.values():
         table.add_column(heading, justify="right")
-    for name in STEP_NAMES:
+    for name in telemetry.STEP_NAMES:
         if name not in result.steps:
             continue
         step, median = result.steps[name].step, result.steps[name].median
@@ -366,7 +357,7 @@ def check_table(result: ConformanceResult) -> Table:
     return table
 
 
-def _cell(figure: str, median: StepResponse, stored: StoredStep, outside: bool) -> Text:
+def _cell(figure: str, median: telemetry.StepResponse, stored: StoredStep, outside: bool) -> Text:
     """Return measured value, stored value and difference, one below the other."""
     _, scale, digits = FIGURES[figure]
     measured, expected = getattr(median, figure), getattr(stored, figure)

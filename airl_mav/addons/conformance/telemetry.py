@@ -15,14 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.conformance.checklist import (
-    ARMED_FLAG,
-    LandedState,
-    MavCommand,
-    MavResult,
-    Transcript,
-    name_of,
-)
+from airl_mav.addons.conformance import checklist
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.frames import wrap_pi
@@ -78,7 +71,7 @@ class StatusText(NamedTuple):
 class TelemetryBuffer:
     """Telemetry, texts and answers; written by MAVSDK's threads, read from any."""
 
-    def __init__(self, transcript: Transcript) -> None:
+    def __init__(self, transcript: checklist.Transcript) -> None:
         self._transcript = transcript
         self._lock = threading.Lock()
         self._wall = WallClock()
@@ -155,8 +148,9 @@ class TelemetryBuffer:
         if self.unlogged_acks[command]:
             self.unlogged_acks[command] -= 1
             return
-        answer = f"{name_of(MavCommand, command)} {name_of(MavResult, fields['result'])}"
-        self._transcript.add("heard", f"COMMAND_ACK {answer}")
+        name = checklist.name_of(checklist.MavCommand, command)
+        result = checklist.name_of(checklist.MavResult, fields["result"])
+        self._transcript.add("heard", f"COMMAND_ACK {name} {result}")
 
     def _take_text(self, fields: Fields) -> None:
         """Join the parts of a long text: another part follows a full one with the same id."""
@@ -173,7 +167,11 @@ class TelemetryBuffer:
 
     def _take_heartbeat(self, fields: Fields, previous: Fields | None) -> None:
         def state(beat: Fields) -> tuple[int, bool, int]:
-            return beat["custom_mode"], bool(beat["base_mode"] & ARMED_FLAG), beat["system_status"]
+            return (
+                beat["custom_mode"],
+                bool(beat["base_mode"] & checklist.ARMED_FLAG),
+                beat["system_status"],
+            )
 
         if previous is not None and state(previous) == state(fields):
             return
@@ -187,7 +185,9 @@ class TelemetryBuffer:
     def _take_landed(self, state: int) -> None:
         if not self.landed_states or self.landed_states[-1] != state:
             self.landed_states.append(state)
-            self._transcript.add("heard", f"EXTENDED_SYS_STATE {name_of(LandedState, state)}")
+            self._transcript.add(
+                "heard", f"EXTENDED_SYS_STATE {checklist.name_of(checklist.LandedState, state)}"
+            )
 
 
 StepName = Literal[

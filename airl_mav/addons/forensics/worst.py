@@ -13,44 +13,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.forensics.camera_view import (
-    ObstacleView,
-    bearing,
-    passes_through,
-    view_obstacle,
-    view_wall,
-)
-from airl_mav.addons.forensics.long_flights import (
-    HALF_WIDTH_M,
-    NO_CAUSE,
-    Evidence,
-    cause_of_long_flight,
-)
+from airl_mav.addons.forensics import camera_view, long_flights
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.stopping import braking_of
-from airl_mav.flight.episode_record import (
-    EpisodeRecord,
-    UsualFlight,
-    path_excess,
-    ranked,
-    straight_m,
-    time_lost_s,
-    usual_flight,
-)
+from airl_mav.flight import episode_record
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory, measure_leg, pose_at
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.document import (
-    NONE,
-    OUTCOME_LABELS,
-    Section,
-    TableView,
-    columns_of,
-    tables_section,
-)
+from airl_mav.report import document
 from airl_mav.report.policy_view import PolicyCamera
 from airl_mav.report.run_arenas import flown_path
 from airl_mav.report.run_report import EXAMINED, Cause, ExaminedFlight, ReportInput
@@ -85,7 +58,7 @@ class CollisionAnalysis:
     """Distance flown before the motors' response."""
     answer_m_s: float | None
     """Speed at the motors' response."""
-    view: ObstacleView | None
+    view: camera_view.ObstacleView | None
     """Point of impact as seen in that frame; None without the arena or the camera."""
     glass: bool
     """True if the obstacle is glass and the camera measures through it."""
@@ -114,7 +87,7 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine_collision(flight: Evidence) -> CollisionAnalysis | None:
+def examine_collision(flight: long_flights.Evidence) -> CollisionAnalysis | None:
     """Return the analysis of a collision; None without a collision or a recording."""
     record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
@@ -140,18 +113,22 @@ def examine_collision(flight: Evidence) -> CollisionAnalysis | None:
             if number is not None:
                 began_us, camera = record.started_us, flight.camera
                 views = [
-                    view_obstacle(path, int(frame), hit_us, arena, began_us, number, camera)
+                    camera_view.view_obstacle(
+                        path, int(frame), hit_us, arena, began_us, number, camera
+                    )
                     for frame in frames
                 ]
                 view = views[-1]
-                glass = passes_through(arena, number, camera)
+                glass = camera_view.passes_through(arena, number, camera)
                 seen = tuple((v.share or 0.0) >= SEEN_SHARE for v in views)
             elif "wall" in record.reason:
-                view = view_wall(path, frame_us, hit_us, arena)
+                view = camera_view.view_wall(path, frame_us, hit_us, arena)
     return CollisionAnalysis(
         what=record.reason.removeprefix("hit ").removesuffix(" during the take-off"),
         speed_m_s=float(np.linalg.norm(velocity)),
-        off_heading_rad=bearing(quaternion, velocity) if math.hypot(*velocity[:2]) > 0.2 else 0.0,
+        off_heading_rad=camera_view.bearing(quaternion, velocity)
+        if math.hypot(*velocity[:2]) > 0.2
+        else 0.0,
         before_s=before_s,
         blind_m=blind_m,
         lag_s=lag_s,
@@ -173,31 +150,35 @@ before it brakes or swerves."""
 USUAL = "as usual"
 
 
-def cause_of(flight: Evidence, usual: UsualFlight) -> Cause:
+def cause_of(flight: long_flights.Evidence, usual: episode_record.UsualFlight) -> Cause:
     """Return the cause of a failure or of a longer flight than usual."""
     outcome = flight.record.outcome
     if outcome is Outcome.ABORTED:
         return Cause("aborted", (f"{flight.record.reason}.",))
     if outcome is Outcome.COLLISION:
         crash = examine_collision(flight)
-        return Cause(NO_CAUSE, ()) if crash is None else _cause_of_collision(flight, crash)
+        return (
+            Cause(long_flights.NO_CAUSE, ())
+            if crash is None
+            else _cause_of_collision(flight, crash)
+        )
     if not len(flight.path):
-        return Cause(NO_CAUSE, ())
+        return Cause(long_flights.NO_CAUSE, ())
     if outcome is Outcome.SUCCESS and not _slow(flight.record, usual):
         return Cause(USUAL, ())
-    return cause_of_long_flight(flight, usual)
+    return long_flights.cause_of_long_flight(flight, usual)
 
 
-def _slow(record: EpisodeRecord, usual: UsualFlight) -> bool:
+def _slow(record: episode_record.EpisodeRecord, usual: episode_record.UsualFlight) -> bool:
     """Return True if time or distance of a flight clearly exceeds the run's median."""
-    lost, excess = time_lost_s(record, usual), path_excess(record)
+    lost, excess = episode_record.time_lost_s(record, usual), episode_record.path_excess(record)
     if lost is None or excess is None or usual.pace_s_m is None or usual.path_ratio is None:
         return False
-    slow = lost > SLOW_EXCESS * usual.pace_s_m * straight_m(record)
+    slow = lost > SLOW_EXCESS * usual.pace_s_m * episode_record.straight_m(record)
     return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * usual.path_ratio
 
 
-def _cause_of_collision(flight: Evidence, crash: CollisionAnalysis) -> Cause:
+def _cause_of_collision(flight: long_flights.Evidence, crash: CollisionAnalysis) -> Cause:
     if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
         return Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
     if crash.before_s is None or crash.blind_m is None:
@@ -206,7 +187,7 @@ def _cause_of_collision(flight: Evidence, crash: CollisionAnalysis) -> Cause:
         f"The last frame that still moved the motors was {crash.before_s:.2f} s old at the "
         f"collision; the vehicle flew {crash.blind_m:.1f} m on it."
     ]
-    kind = NO_CAUSE
+    kind = long_flights.NO_CAUSE
     if (view := crash.view) is not None:
         sentences.insert(0, _where(crash, flight.camera))
         half_angle = flight.camera.half_angle_rad if flight.camera else math.pi
@@ -236,14 +217,16 @@ def _cause_of_collision(flight: Evidence, crash: CollisionAnalysis) -> Cause:
 
 
 def _seen(
-    crash: CollisionAnalysis, view: ObstacleView, braking_m: Callable[[float], float] | None
+    crash: CollisionAnalysis,
+    view: camera_view.ObstacleView,
+    braking_m: Callable[[float], float] | None,
 ) -> str:
     """Return the cause for a visible obstacle, by the time to act and the distance to stop."""
     if crash.lag_m is None or crash.lag_s is None or crash.before_s is None:
         return "seen and flown into"
     if crash.before_s - crash.lag_s < ACT_S:
         return "seen too late to act"
-    room_m = max(0.0, view.distance_m - HALF_WIDTH_M - crash.lag_m)
+    room_m = max(0.0, view.distance_m - long_flights.HALF_WIDTH_M - crash.lag_m)
     if braking_m is None or crash.answer_m_s is None:
         return "seen and flown into"
     stops = braking_m(crash.answer_m_s) <= room_m
@@ -295,13 +278,13 @@ def examine_worst(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
 ) -> list[ExaminedFlight]:
     """Return up to `EXAMINED` worst flights with their causes, as far as data allow."""
-    usual = usual_flight(run.episodes)
+    usual = episode_record.usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else partial(_braking_m, vehicle)
     examined = []
-    for record in ranked(run.episodes)[:EXAMINED]:
+    for record in episode_record.ranked(run.episodes)[:EXAMINED]:
         path = flown_path(run, record)
-        flight = Evidence(
+        flight = long_flights.Evidence(
             record,
             NOT_RECORDED if path is None else path,
             run.latency.get(record.index, {}),
@@ -309,16 +292,19 @@ def examine_worst(
             camera,
             brake,
         )
-        lost_s, excess = (time_lost_s(record, usual), path_excess(record))
+        lost_s, excess = (
+            episode_record.time_lost_s(record, usual),
+            episode_record.path_excess(record),
+        )
         examined.append(ExaminedFlight(record, cause_of(flight, usual), lost_s, excess))
     return examined
 
 
-def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView | None:
+def worst_table(judged: Sequence[ExaminedFlight], total: int) -> document.TableView | None:
     """Return the worst flights with their causes; None without flights."""
     if not judged:
         return None
-    columns = columns_of(
+    columns = document.columns_of(
         "# | seed | <outcome | after [s] | time lost [s] | way [x straight] | <cause"
     )
     shown = judged[:LISTED]
@@ -329,7 +315,7 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView | Non
     if len(shown) < total:
         notes.append(f"The {len(shown)} worst of {total:,} flights.")
     rows, links = tuple(map(_row, shown)), [(each.record.index, None) for each in shown]
-    return TableView("worst", "Worst flights", columns, rows, tuple(notes), links=links)
+    return document.TableView("worst", "Worst flights", columns, rows, tuple(notes), links=links)
 
 
 def _row(judged: ExaminedFlight) -> tuple[str, ...]:
@@ -340,15 +326,17 @@ def _row(judged: ExaminedFlight) -> tuple[str, ...]:
     return (
         f"{record.index}",
         f"{record.seed}",
-        OUTCOME_LABELS[record.outcome],
+        document.OUTCOME_LABELS[record.outcome],
         f"{(record.ended_us - record.zero_us) / US_PER_S:.1f}",
-        NONE if judged.lost_s is None or not whole else f"{round(judged.lost_s, 1) + 0.0:+.1f}",
-        NONE if judged.excess is None or not arrived else f"{1.0 + judged.excess:.2f}",
+        document.NONE
+        if judged.lost_s is None or not whole
+        else f"{round(judged.lost_s, 1) + 0.0:+.1f}",
+        document.NONE if judged.excess is None or not arrived else f"{1.0 + judged.excess:.2f}",
         judged.cause.kind,
     )
 
 
-def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView | None:
+def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> document.TableView | None:
     """Return the number of failed flights by cause; None for fewer than two failures."""
     failed = [j for j in judged if j.record.outcome is not Outcome.SUCCESS]
     if len(failed) < 2:
@@ -360,18 +348,18 @@ def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView 
         more = ", …" if len(which) > NAMED else ""
         share = f"{100.0 * count / len(failed):.0f}"
         rows.append((kind, f"{count}", share, ", ".join(which[:NAMED]) + more))
-    columns = columns_of("<cause | flights | of those that failed [%] | <which")
+    columns = document.columns_of("<cause | flights | of those that failed [%] | <which")
     all_failed = sum(e.outcome is not Outcome.SUCCESS for e in run.episodes)
     notes: tuple[str, ...] = ()
     if all_failed > len(failed):
         notes = (f"The first {len(failed)} of {all_failed:,} flights that failed.",)
-    return TableView("causes", "Why flights failed", columns, tuple(rows), notes)
+    return document.TableView("causes", "Why flights failed", columns, tuple(rows), notes)
 
 
-def worst_section(page: ReportInput) -> tuple[Section, ...]:
+def worst_section(page: ReportInput) -> tuple[document.Section, ...]:
     """Return the causes of failed flights, and the worst flights."""
-    causes = tables_section(causes_table(page.worst, page.run))
-    return causes + tables_section(worst_table(page.worst, len(page.run.episodes)))
+    causes = document.tables_section(causes_table(page.worst, page.run))
+    return causes + document.tables_section(worst_table(page.worst, len(page.run.episodes)))
 
 
 def _braking_m(vehicle: VehicleProfile, speed_m_s: float) -> float:

@@ -19,13 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from airl_mav.addons.profiling.measurement import (
-    FLOWN_SPEED_M_S,
-    ProfileRequest,
-    ProfilingError,
-    Recording,
-    Stamps,
-)
+from airl_mav.addons.profiling import measurement
 from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
 from airl_mav.core.child_process import signal_handlers
 from airl_mav.core.clock import NS_PER_US, WallClock
@@ -85,7 +79,9 @@ class DecisionLimit:
         return self._policy.act(observation)
 
 
-def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
+def measure(
+    request: measurement.ProfileRequest, policy: PolicyUnderTest, bar: Bar
+) -> measurement.Recording:
     """Fly until there are enough decisions; Ctrl-C lands. Arguments as `sitl.measure`."""
     load_us, first_us, _ = cold_start(request, policy)
     interrupted, stop = threading.Event(), threading.Event()
@@ -100,28 +96,30 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
         except LinkError as error:
             if interrupted.is_set():
                 raise KeyboardInterrupt from None
-            raise ProfilingError(str(error)) from error
+            raise measurement.ProfilingError(str(error)) from error
     if interrupted.is_set():
         raise KeyboardInterrupt
     decisions = len(mission.result.log)
     if decisions < request.warm_up + request.decisions:
-        raise ProfilingError(f"{mission.result.reason} after {decisions} decisions: too few")
+        raise measurement.ProfilingError(
+            f"{mission.result.reason} after {decisions} decisions: too few"
+        )
     stamps, exposure, remarks = relate_stamps(mission, request.warm_up)
-    return Recording(
+    return measurement.Recording(
         flights=(stamps,),
         exposure=exposure,
         load_us=load_us,
         first_us=first_us,
         remarks=(
             f"in flight against a simulator elsewhere, hold {request.hold_s:g} s and at most "
-            f"{FLOWN_SPEED_M_S:g} m/s: timing was measured, not the quality of flight",
+            f"{measurement.FLOWN_SPEED_M_S:g} m/s: timing was measured, not the quality of flight",
             *remarks,
         ),
     )
 
 
 def _fly(
-    request: ProfileRequest,
+    request: measurement.ProfileRequest,
     policy: PolicyUnderTest,
     bar: Bar,
     stop: threading.Event,
@@ -158,7 +156,9 @@ def _fly(
         return TimedMission(result, before, during, link.take_exchanges())
 
 
-def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
+def relate_stamps(
+    mission: TimedMission, warm_up: int
+) -> tuple[measurement.Stamps, str, tuple[str, ...]]:
     """Convert the frames' exposure to this computer's clock, if the clocks can be related.
 
     Returns columns after the warm-up, with `exchange_*` columns of one row per exchange in flight;

@@ -9,13 +9,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from airl_mav.addons.profiling.measurement import (
-    FLOWN_SPEED_M_S,
-    ProfileRequest,
-    ProfilingError,
-    Recording,
-    Stamps,
-)
+from airl_mav.addons.profiling import measurement
 from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
 from airl_mav.core.child_process import terminated_as_interrupted
 from airl_mav.core.constants import US_PER_S
@@ -58,7 +52,9 @@ class DecisionEstimate(LiveObserver):
             self._decisions.update(completed=self._before + flown)
 
 
-def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
+def measure(
+    request: measurement.ProfileRequest, policy: PolicyUnderTest, bar: Bar
+) -> measurement.Recording:
     """Fly until there are enough decisions; arguments as `policy_under_test.measure`."""
     # Before the network is opened elsewhere.
     load_us, first_us, later_us = cold_start(request, policy)
@@ -79,24 +75,24 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
         try:
             flights = tuple(_flights(request, scenario, period_s, bar))
         except RehearsalError as error:
-            raise ProfilingError(str(error)) from error
+            raise measurement.ProfilingError(str(error)) from error
     many = f", {len(flights)} flights" if len(flights) > 1 else ""
-    return Recording(
+    return measurement.Recording(
         flights=flights,
         exposure="capture_us",
         load_us=load_us,
         first_us=first_us,
         remarks=(
             f"in flight at real time{many}, hold {request.hold_s:g} s and at most "
-            f"{FLOWN_SPEED_M_S:g} m/s: timing was measured, not the quality of flight",
+            f"{measurement.FLOWN_SPEED_M_S:g} m/s: timing was measured, not the quality of flight",
             "plant, autopilot and camera ran on the same machine",
         ),
     )
 
 
 def _flights(
-    request: ProfileRequest, scenario: ResolvedScenario, period_s: float, bar: Bar
-) -> Iterator[Stamps]:
+    request: measurement.ProfileRequest, scenario: ResolvedScenario, period_s: float, bar: Bar
+) -> Iterator[measurement.Stamps]:
     """Yield the stamps of each flight, without warm-up, until there are enough."""
     count = number = 0
     while (missing := request.decisions - count) > 0:
@@ -111,7 +107,7 @@ def _flights(
         rows = len(stamps["sent_us"])
         if rows <= request.warm_up:
             (record,) = observer.finished_records
-            raise ProfilingError(
+            raise measurement.ProfilingError(
                 f"flight {number} gave {rows} decisions; more than the warm-up of "
                 f"{request.warm_up} are needed ({'; '.join((record.reason, *record.notes))})"
             )
@@ -120,7 +116,7 @@ def _flights(
         period_s = float(np.diff(stamps["sent_us"]).mean()) / US_PER_S
 
 
-def _fly(scenario: ResolvedScenario, observer: DecisionEstimate) -> Stamps:
+def _fly(scenario: ResolvedScenario, observer: DecisionEstimate) -> measurement.Stamps:
     """Fly once; return the stamps by the simulator's clock. Raises RehearsalError."""
     with TemporaryDirectory(prefix="airl-profile-") as scratch:
         path = Path(scratch) / "run"

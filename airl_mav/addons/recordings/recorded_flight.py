@@ -22,14 +22,7 @@ from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS
-from airl_mav.rehearsal.run_folder import (
-    RUN_FILE,
-    FlownEpisode,
-    RunFolder,
-    RunInfo,
-    load_info,
-    run_info,
-)
+from airl_mav.rehearsal import run_folder
 from companion.limits import OUT_OF_TIME
 
 NAVIGATING = "navigating"
@@ -77,16 +70,16 @@ def settings_of(box: BlackBox) -> FlownSettings:
     return typed(_SETTINGS, box.run.get("config", {}), box.path)
 
 
-def info_of(box: BlackBox, digest: str = "") -> RunInfo:
+def info_of(box: BlackBox, digest: str = "") -> run_folder.RunInfo:
     """Return the description of the run. Raises UsageError if the black box lacks it."""
     run = box.run
-    info = run_info(run, box.path)
+    info = run_folder.run_info(run, box.path)
     return replace(info, config={**info.config, DIGEST: digest})
 
 
 def episode_of(
     box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
-) -> FlownEpisode:
+) -> run_folder.FlownEpisode:
     """Return the flight of a black box, or raise UsageError; `path` replaces its telemetry."""
     asked = settings_of(box)
     path = path_of(box) if path is None else path
@@ -130,7 +123,7 @@ def episode_of(
         notes=(*remarks, *notes),
         companion_use=_use(box.all_of(Resources)),
     )
-    return FlownEpisode(record, path, stamps)
+    return run_folder.FlownEpisode(record, path, stamps)
 
 
 def path_of(box: BlackBox) -> Trajectory:
@@ -238,12 +231,12 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
 
         log = read_vehicle_log(ulg)
         digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()
-    if (folder / RUN_FILE).exists():
-        if load_info(folder).config.get(DIGEST) != digest:
+    if (folder / run_folder.RUN_FILE).exists():
+        if run_folder.load_info(folder).config.get(DIGEST) != digest:
             raise UsageError(
                 f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
             )
         return folder
     episode = episode_of(box) if ulg is None else logged_episode_of(box, log)
-    RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
+    run_folder.RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
     return folder

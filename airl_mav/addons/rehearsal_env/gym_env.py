@@ -20,17 +20,10 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import goal_distance_m, quat_yaw
+from airl_mav.envs import navigation_env
 from airl_mav.envs.arena_batch import CEILING, FLOOR, NOTHING, WALL
 from airl_mav.envs.draws import source_of
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
-from airl_mav.envs.navigation_env import (
-    action_space,
-    checked_actions,
-    draw_seeds,
-    episode_seed,
-    observation_space,
-    zone_option,
-)
 from airl_mav.envs.observations import sight_of
 from airl_mav.envs.rendering import RENDER_MODES, PictureContent, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
@@ -172,8 +165,8 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._sources = injections_of(self.environment.delay)
         # Kernels compile here instead of in the first episode.
         warm_up(self._resolved.vehicle, self._resolved.scenario.plant)
-        self.observation_space: gym.Space[Any] = observation_space(self._sees)
-        self.action_space = action_space(actions)
+        self.observation_space: gym.Space[Any] = navigation_env.observation_space(self._sees)
+        self.action_space = navigation_env.action_space(actions)
         self.flown: FlownEpisode | None = None
         """Newest completed episode: record, true trajectory, latencies."""
         self._flight: AskedFlight | None = None
@@ -198,12 +191,16 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         # A running flight ends before the next one starts.
         self._end()
         if seed is not None or options:
-            zone = zone_option(options)
+            zone = navigation_env.zone_option(options)
             scenario = self._resolved.scenario.model_copy(update={"zone": zone})
             self._resolved = replace(self._resolved, scenario=scenario)
         super().reset(seed=seed)
         # Without a seed, the episode's seed comes from the environment's generator.
-        self._seed = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
+        self._seed = (
+            navigation_env.draw_seeds(self.np_random, 1)[0]
+            if seed is None
+            else navigation_env.episode_seed(seed)
+        )
         resolved = self._resolved
         if len(self._sources) > 1:
             resolved = replace(resolved, injection=source_of(self._sources, self._seed))
@@ -240,7 +237,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
                 "step() without an episode that goes on: reset() begins one"
             )
         # Checked before the flight continues: an invalid action changes nothing.
-        number = checked_actions(spec, action, ())
+        number = navigation_env.checked_actions(spec, action, ())
         asked = self._heard(lambda: flight.answer(command(spec, number)))
         # Reward terms compare the state before and after the decision.
         before, now, outcome = self._before, flight.flights(), flight.outcome()

@@ -21,16 +21,9 @@ from airl_mav.arena.geometry import Shape
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import G_PER_KG, MS_PER_S, TICK_S
 from airl_mav.core.fields import ProfileModel
+from airl_mav.envs import stopping
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.fleet import hover, new_fleet
-from airl_mav.envs.stopping import (
-    ALTITUDE_M,
-    Braking,
-    StoppingTask,
-    braking_of,
-    open_space,
-    twin_of,
-)
 from airl_mav.flight.energy import level_powers_w
 from airl_mav.latency.injection import Injection, longest_ms
 from airl_mav.latency.stages import f1_knee_hz, f1_velocity, max_acceleration
@@ -41,15 +34,7 @@ from airl_mav.policy.observation import InFlight, Kinematics, observe
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.report import theme
-from airl_mav.report.document import (
-    Document,
-    Facts,
-    Section,
-    TableView,
-    columns_of,
-    provenance_facts,
-)
+from airl_mav.report import document, theme
 
 if TYPE_CHECKING:
     from airl_mav.addons.roofline.roofline import RooflineRequest
@@ -94,7 +79,7 @@ class RooflinePoint(ProfileModel):
     """Safe velocity by the F-1 model [m/s]."""
     f1_roof_m_s: float
     f1_knee_hz: float
-    braking: Braking
+    braking: stopping.Braking
     measured_m_s: float
     """Safe velocity by the measured braking [m/s]."""
     roof_m_s: float
@@ -143,7 +128,7 @@ class Roofline(ProfileModel):
 def roofline_point(
     name: str,
     computer: ComputerProfile,
-    task: StoppingTask,
+    task: stopping.StoppingTask,
     injection: Injection,
     request: RooflineRequest,
 ) -> RooflinePoint:
@@ -171,7 +156,7 @@ def roofline_point(
         "hold": loop.hold_s,
         "link": loop.link_s + TICK_S,
     }
-    braking, room, a = braking_of(vehicle), task.room_m, max_acceleration(vehicle)
+    braking, room, a = stopping.braking_of(vehicle), task.room_m, max_acceleration(vehicle)
     roof = braking.safe_velocity(0.0, room)
     at_knee = request.knee_share * roof
     braked = braking.stopping_m(at_knee, 0.0)
@@ -233,9 +218,13 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
     camera, card = vehicle.camera, policy.card
     depths = np.arange(STEP_M, camera.range_m, STEP_M)
     n = len(depths) + 1  # the last row flies in open space
-    fleet, arenas, shared = new_fleet(n), open_space(n, obstacles=1), twin_of(vehicle)
+    fleet, arenas, shared = (
+        new_fleet(n),
+        stopping.open_space(n, obstacles=1),
+        stopping.twin_of(vehicle),
+    )
     for i in range(n):
-        hover(fleet, i, ALTITUDE_M, shared)
+        hover(fleet, i, stopping.ALTITUDE_M, shared)
     fleet.velocity[:, 0] = card.actions.max_speed_m_s
     arenas.n_obstacles[:-1] = 1
     arenas.shape[:] = Shape.BOX
@@ -277,16 +266,16 @@ RATES = 200
 """Number of points of a curve."""
 
 
-def roofline_document(found: Roofline, made: Mapping[str, Any]) -> Document:
+def roofline_document(found: Roofline, made: Mapping[str, Any]) -> document.Document:
     """Return the document of a roofline with one or more points; `made` is its provenance."""
-    return Document(
+    return document.Document(
         name="roofline",
         title=f"Roofline of {found.vehicle}",
         kicker=f"Safe velocity by reaction time · {found.policy} · {found.workload}",
         answers=tuple(_answer(point) for point in found.points)
         + tuple(f"{each.computer} left out: {each.why}." for each in found.left_out),
         sections=(
-            Section(
+            document.Section(
                 "Safe velocity",
                 tables=(velocity_table(found), reaction_table(found), aircraft_table(found)),
                 draw=lambda: [roofline_picture(found)],
@@ -295,7 +284,7 @@ def roofline_document(found: Roofline, made: Mapping[str, Any]) -> Document:
         facts=_facts(found),
         provenance=(
             ("command", f"{made['command']}"),
-            *provenance_facts(made["machine"], made["git"], made["versions"]),
+            *document.provenance_facts(made["machine"], made["git"], made["versions"]),
         ),
         configurations=(("the roofline", json.dumps(found.model_dump(), indent=2)),),
         footer="Figures as data in roofline.json beside this page",
@@ -309,7 +298,7 @@ def _answer(point: RooflinePoint) -> str:
     )
 
 
-def _facts(found: Roofline) -> Facts:
+def _facts(found: Roofline) -> document.Facts:
     distance = f"{found.sensing_distance_m:.1f} m"
     if found.noticed_m:
         depths = np.array(found.noticed_m)
@@ -328,9 +317,9 @@ def _facts(found: Roofline) -> Facts:
     )
 
 
-def velocity_table(found: Roofline) -> TableView:
+def velocity_table(found: Roofline) -> document.TableView:
     """Return the safe velocity on each computer: model, measurement, flight and roofs."""
-    columns = columns_of(
+    columns = document.columns_of(
         "<computer | F-1 [m/s] | measured [m/s] | flown [m/s] | "
         "roof, F-1 [m/s] | roof [m/s] | <binds"
     )
@@ -351,12 +340,12 @@ def velocity_table(found: Roofline) -> TableView:
         "vehicle's own way to a stand, with its computer on board. Flown: greatest speed at which "
         f"none of {found.draws:,} flights touched an obstacle that came up at the worst moment.",
     )
-    return TableView("velocities", "Safe velocity", columns, rows, notes)
+    return document.TableView("velocities", "Safe velocity", columns, rows, notes)
 
 
-def aircraft_table(found: Roofline) -> TableView:
+def aircraft_table(found: Roofline) -> document.TableView:
     """Return mass and power of each computer on board, and the missions per charge."""
-    columns = columns_of(
+    columns = document.columns_of(
         "<computer | on board [g] | draws [W] | take-off mass [kg] | power [W] | missions"
     )
     rows = tuple(
@@ -374,12 +363,12 @@ def aircraft_table(found: Roofline) -> TableView:
         f"Missions: {found.mission_m:g} m each, on a full charge, level at the measured safe "
         "velocity; take-off, landing and manoeuvres come on top.",
     )
-    return TableView("aircraft", "With the computer on board", columns, rows, notes)
+    return document.TableView("aircraft", "With the computer on board", columns, rows, notes)
 
 
-def reaction_table(found: Roofline) -> TableView:
+def reaction_table(found: Roofline) -> document.TableView:
     """Return the parts of each computer's reaction time, and the knee."""
-    columns = columns_of(
+    columns = document.columns_of(
         "<computer | sensor [s] | 2 x t2 [s] | hold [s] | link [s] | "
         "T [s] | 1 / T [Hz] | knee, F-1 [Hz] | knee [Hz]"
     )
@@ -400,7 +389,7 @@ def reaction_table(found: Roofline) -> TableView:
         "the 99.9 % quantile, or the greatest sample.",
         *(f"{point.computer}: {point.latency}." for point in found.points),
     )
-    return TableView("reaction", "Reaction time", columns, rows, notes)
+    return document.TableView("reaction", "Reaction time", columns, rows, notes)
 
 
 def roofline_picture(found: Roofline) -> theme.FigureImage:

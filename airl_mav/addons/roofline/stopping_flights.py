@@ -10,21 +10,10 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
 from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.envs import stopping
 from airl_mav.envs.arena_batch import ArenaBatch
 from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.fleet_step import advance
-from airl_mav.envs.stopping import (
-    ALTITUDE_M,
-    MOMENTS_S,
-    RULES,
-    DecisionLoop,
-    StoppingTask,
-    braking_of,
-    open_space,
-    run_ups,
-    stop,
-    twin_of,
-)
 from airl_mav.latency.injection import FixedSampler, Injection, LatencySampler, latency_generator
 
 WALL_HALF_M = (0.5, 20.0, 5.0)
@@ -39,7 +28,12 @@ _LEAST_SPEED_M_S = 0.01
 
 
 def fly_into(
-    task: StoppingTask, speed_m_s: float, latency: Injection, native_s: float, draws: int, seed: int
+    task: stopping.StoppingTask,
+    speed_m_s: float,
+    latency: Injection,
+    native_s: float,
+    draws: int,
+    seed: int,
 ) -> NDArray[np.bool_]:
     """Fly level towards an obstacle that appears at the worst time, and stop.
 
@@ -63,20 +57,20 @@ def fly_into(
     others = [np.random.default_rng((seed + i, draws)) for i in range(draws)]
     phases = np.array([rng.random(2) for rng in others])
     reaction_us = _reactions_us(task.loop, samplers, phases[:, 0])
-    shared = twin_of(task.vehicle)
-    moments = (phases[:, 1] * len(MOMENTS_S)).astype(np.int64)
-    flying = run_ups(shared, [speed_m_s], MOMENTS_S)
+    shared = stopping.twin_of(task.vehicle)
+    moments = (phases[:, 1] * len(stopping.MOMENTS_S)).astype(np.int64)
+    flying = stopping.run_ups(shared, [speed_m_s], stopping.MOMENTS_S)
     fleet = Fleet._make(array[moments] for array in flying)
     walls = _walls(fleet.position, task)
     # A setpoint takes effect at the flight controller's next tick.
-    advance(fleet, walls, -(-reaction_us // TICK_US), shared, RULES, None)
-    stop(fleet, walls, shared)
+    advance(fleet, walls, -(-reaction_us // TICK_US), shared, stopping.RULES, None)
+    stopping.stop(fleet, walls, shared)
     touched: NDArray[np.bool_] = fleet.verdict == FlightStatus.COLLISION
     return touched
 
 
 def greatest_speed(
-    task: StoppingTask, latency: Injection, native_s: float, draws: int, seed: int
+    task: stopping.StoppingTask, latency: Injection, native_s: float, draws: int, seed: int
 ) -> float:
     """Return the maximum speed without a collision in `fly_into`, by bisection [m/s].
 
@@ -87,7 +81,7 @@ def greatest_speed(
     def stands(speed_m_s: float) -> bool:
         return not fly_into(task, speed_m_s, latency, native_s, draws, seed).any()
 
-    low, high = _LEAST_SPEED_M_S, braking_of(task.vehicle).fastest_m_s
+    low, high = _LEAST_SPEED_M_S, stopping.braking_of(task.vehicle).fastest_m_s
     # The usual results first: no limit, or no speed at all.
     if stands(high):
         return high
@@ -104,7 +98,7 @@ def _us(time_s: float) -> int:
 
 
 def _reactions_us(
-    loop: DecisionLoop, samplers: list[LatencySampler], phases: NDArray[np.float64]
+    loop: stopping.DecisionLoop, samplers: list[LatencySampler], phases: NDArray[np.float64]
 ) -> NDArray[np.int64]:
     """Return the time of each flight from the obstacle's appearance to the motors (n,) [µs].
 
@@ -124,13 +118,13 @@ def _reactions_us(
     return times
 
 
-def _walls(position: NDArray[np.float64], task: StoppingTask) -> ArenaBatch:
+def _walls(position: NDArray[np.float64], task: stopping.StoppingTask) -> ArenaBatch:
     """Return a wall for each vehicle (n, 3), at the sensing distance from its camera."""
-    walls = open_space(len(position), obstacles=1)
+    walls = stopping.open_space(len(position), obstacles=1)
     walls.n_obstacles[:] = 1
     walls.shape[:] = Shape.BOX
     walls.half_size[:] = WALL_HALF_M
     lens = position[:, 0] + task.vehicle.camera.forward_m
     walls.center[:, 0, 0] = lens + task.sensing_distance_m + WALL_HALF_M[0]
-    walls.center[:, 0, 2] = -ALTITUDE_M
+    walls.center[:, 0, 2] = -stopping.ALTITUDE_M
     return walls

@@ -38,15 +38,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
+from airl_mav.experiments import executors
 from airl_mav.experiments.campaign import open_campaign
-from airl_mav.experiments.executors import (
-    Executor,
-    ExecutorSettings,
-    Stop,
-    WorkerError,
-    never,
-    open_executor,
-)
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
@@ -136,14 +129,16 @@ class SweepOptions(Workers):
                 grid["arena"] = f"{Path(grid['arena']).absolute()}"
         return validated(SweepConfig, data)
 
-    def executor_settings(self) -> ExecutorSettings:
+    def executor_settings(self) -> executors.ExecutorSettings:
         """Return the executor settings of the trials, with their GPU share."""
         gpus = self.ray_gpus
         if gpus is not None and self.executor != "ray":
             raise FieldError("ray_gpus", gpus, "with executor ray")
         data = {name: getattr(self, name) for name in Workers.model_fields}
         default = 1.0 if self.device == "cuda" else 0.0
-        return validated(ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus})
+        return validated(
+            executors.ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus}
+        )
 
     def for_computer(self) -> Computer | None:
         """Return the computer for each cell's decision latency, or None."""
@@ -165,7 +160,7 @@ def _worker(
     folder: SweepFolder,
     command: str,
     device: str,
-    stop: Stop,  # noqa: ARG001 (a worker is killed, and loses no checkpoint)
+    stop: executors.Stop,  # noqa: ARG001 (a worker is killed, and loses no checkpoint)
 ) -> Callable[[Trial], list[TrialResult]]:
     """Return the function that runs a trial."""
     # Imported late: the learner takes two seconds to load, and only a worker needs it.
@@ -177,13 +172,13 @@ def _worker(
 def run_sweep(
     path: Path,
     config: SweepConfig,
-    executor: Executor,
+    executor: executors.Executor,
     *,
     command: str,
     progress: Progress,
     device: str = "cpu",
     computer: Computer | None = None,
-    stop: Stop = never,
+    stop: executors.Stop = executors.never,
 ) -> tuple[Sweep, str | None]:
     """Run the remaining trials; `sweep.json` is written after each.
 
@@ -221,7 +216,7 @@ def run_sweep(
                 for _, result in results:
                     bars.finished(result)
                     sweep = summary()
-        except WorkerError as error:
+        except executors.WorkerError as error:
             return sweep, str(error)
         return sweep, None
 
@@ -290,7 +285,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
         print_plan(options.name, config, computer, path, console)
         return 0
     check_installed("train")
-    with RichProgress(console) as progress, open_executor(settings) as executor:
+    with RichProgress(console) as progress, executors.open_executor(settings) as executor:
         progress.note(f"sweep      {options.name}: {config.description}\nfolder     {path}")
         with stop_on_signals() as stop:
             sweep, error = run_sweep(

@@ -13,34 +13,13 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from rich.console import Console
 
+from airl_mav.addons.sweep import summary
 from airl_mav.addons.sweep.config import SweepConfig, training_of, trials
-from airl_mav.addons.sweep.summary import (
-    SWEEP_FILE,
-    Computer,
-    NetworkSummary,
-    Sweep,
-    SweepFolder,
-    as_data,
-    published_best,
-    summarize,
-)
-from airl_mav.report import theme
-from airl_mav.report.document import (
-    NONE,
-    Column,
-    Document,
-    Facts,
-    Headline,
-    Section,
-    TableView,
-    print_facts,
-    print_table,
-    provenance_facts,
-)
+from airl_mav.report import document, theme
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
 from airl_mav.report.theme import FigureImage
 
-Described = tuple[Column, Callable[[NetworkSummary], str]]
+Described = tuple[document.Column, Callable[[summary.NetworkSummary], str]]
 """Column, and the function that formats its cells."""
 
 
@@ -55,56 +34,56 @@ def count(number: float) -> str:
 def t2_ms(value: float | None) -> str:
     """Return a latency [ms] in three digits."""
     if value is None:
-        return NONE
+        return document.NONE
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def percent(share: float | None) -> str:
     """Return a share as a number of percent."""
-    return NONE if share is None else f"{100.0 * share:.1f}"
+    return document.NONE if share is None else f"{100.0 * share:.1f}"
 
 
-def interval(cell: NetworkSummary) -> str:
+def interval(cell: summary.NetworkSummary) -> str:
     """Return the interval of a network's success in percent."""
     rate = cell.success_rate
-    return NONE if rate.low is None else f"{percent(rate.low)} … {percent(rate.high)}"
+    return document.NONE if rate.low is None else f"{percent(rate.low)} … {percent(rate.high)}"
 
 
-def _seeds(cell: NetworkSummary) -> str:
+def _seeds(cell: summary.NetworkSummary) -> str:
     n = cell.success_rate.n
     return f"{n}" if n == cell.planned else f"{n} of {cell.planned}"
 
 
-def _mean(field: str, form: str, unit: float = 1.0) -> Callable[[NetworkSummary], str]:
+def _mean(field: str, form: str, unit: float = 1.0) -> Callable[[summary.NetworkSummary], str]:
     """Return a formatter of a mean over the seeds, in a given unit."""
 
-    def write(cell: NetworkSummary) -> str:
+    def write(cell: summary.NetworkSummary) -> str:
         value: float | None = getattr(cell, field)
-        return NONE if value is None else f"{value / unit:{form}}"
+        return document.NONE if value is None else f"{value / unit:{form}}"
 
     return write
 
 
-NETWORK: Described = (Column("network", number=False), lambda cell: cell.network)
-MACS: Described = (Column("MACs"), lambda cell: count(cell.macs))
-T2: Described = (Column("t2, estimated", "ms"), lambda cell: t2_ms(cell.t2_ms))
+NETWORK: Described = (document.Column("network", number=False), lambda cell: cell.network)
+MACS: Described = (document.Column("MACs"), lambda cell: count(cell.macs))
+T2: Described = (document.Column("t2, estimated", "ms"), lambda cell: t2_ms(cell.t2_ms))
 
 RESULTS: tuple[Described, ...] = (
     NETWORK,
-    (Column("success", "%"), lambda cell: percent(cell.success_rate.value)),
-    (Column("std"), lambda cell: percent(cell.success_std)),
-    (Column("95 % interval"), interval),
-    (Column("seeds"), _seeds),
-    (Column("time", "s"), _mean("flight_time_s", ".2f")),
-    (Column("distance", "m", page_only=True), _mean("distance_m", ".1f")),
-    (Column("energy", "kJ", page_only=True), _mean("energy_j", ".2f", 1e3)),
-    (Column("best after", page_only=True), _mean("decisions", ",.0f")),
-    (Column("parameters", page_only=True), lambda cell: count(cell.parameters)),
+    (document.Column("success", "%"), lambda cell: percent(cell.success_rate.value)),
+    (document.Column("std"), lambda cell: percent(cell.success_std)),
+    (document.Column("95 % interval"), interval),
+    (document.Column("seeds"), _seeds),
+    (document.Column("time", "s"), _mean("flight_time_s", ".2f")),
+    (document.Column("distance", "m", page_only=True), _mean("distance_m", ".1f")),
+    (document.Column("energy", "kJ", page_only=True), _mean("energy_j", ".2f", 1e3)),
+    (document.Column("best after", page_only=True), _mean("decisions", ",.0f")),
+    (document.Column("parameters", page_only=True), lambda cell: count(cell.parameters)),
     MACS,
 )
 
 
-def networks_table(sweep: Sweep, arena: str) -> TableView:
+def networks_table(sweep: summary.Sweep, arena: str) -> document.TableView:
     """Return the networks of an arena, the best first, networks without a result last."""
     cells = sorted(sweep.of(arena), key=lambda c: (-(c.success_rate.value or -1.0), c.macs))
     notes = [
@@ -122,10 +101,10 @@ def networks_table(sweep: Sweep, arena: str) -> TableView:
 
 
 def print_plan(
-    name: str, config: SweepConfig, computer: Computer | None, path: Path, console: Console
+    name: str, config: SweepConfig, computer: summary.Computer | None, path: Path, console: Console
 ) -> None:
     """Print a sweep's plan; UsageError if the folder contains other results."""
-    sweep = summarize(SweepFolder(path, config), {}, computer)
+    sweep = summary.summarize(summary.SweepFolder(path, config), {}, computer)
     steps, episodes = config.training.steps, config.evaluation.episodes
     most = "at most " if config.training.selection.stop_at is not None else ""
     facts = [
@@ -135,31 +114,33 @@ def print_plan(
         ("decisions", f"{most}{steps:,} each, {most}{steps * sweep.planned:,} in all"),
         ("evaluation", f"{episodes:,} flights each, {episodes * sweep.planned:,} in all"),
     ]
-    print_facts(facts, console)
+    document.print_facts(facts, console)
     planned: tuple[Described, ...] = (
         NETWORK,
-        (Column("trials"), lambda cell: f"{cell.planned}"),
-        (Column("decisions"), lambda cell: f"{steps * cell.planned:,}"),
-        (Column("parameters"), lambda cell: count(cell.parameters)),
+        (document.Column("trials"), lambda cell: f"{cell.planned}"),
+        (document.Column("decisions"), lambda cell: f"{steps * cell.planned:,}"),
+        (document.Column("parameters"), lambda cell: count(cell.parameters)),
         MACS,
     )
     for arena in sweep.arenas:
         console.print()
-        print_table(_table(sweep, f"plan-{arena}", arena, planned, sweep.of(arena)), console)
+        document.print_table(
+            _table(sweep, f"plan-{arena}", arena, planned, sweep.of(arena)), console
+        )
 
 
 def _table(
-    sweep: Sweep,
+    sweep: summary.Sweep,
     key: str,
     title: str,
     described: Sequence[Described],
-    cells: Sequence[NetworkSummary],
+    cells: Sequence[summary.NetworkSummary],
     notes: Sequence[str] = (),
-) -> TableView:
+) -> document.TableView:
     """Return a row for each network, with its latency if a computer was named."""
     shown = (*described, *([T2] if sweep.computer is not None else []))
     rows = tuple(tuple(write(cell) for _, write in shown) for cell in cells)
-    return TableView(key, title, tuple(column for column, _ in shown), rows, tuple(notes))
+    return document.TableView(key, title, tuple(column for column, _ in shown), rows, tuple(notes))
 
 
 ASIDE = 1.03
@@ -169,7 +150,7 @@ LABELLED = 20
 """Maximum number of labelled networks in the trade-off; beyond, only each arena's best."""
 
 
-def success_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
+def success_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
     """Draw the mean success rate of each network of an arena, with its standard deviation."""
     best = sweep.best(arena)
     known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
@@ -193,7 +174,7 @@ def success_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
     return heat_picture(f"sweep-{arena}", alt, heat)
 
 
-def _success_text(cell: NetworkSummary) -> str:
+def _success_text(cell: summary.NetworkSummary) -> str:
     text = percent(cell.success_rate.value)
     if cell.success_std is not None:
         text += f"\n± {percent(cell.success_std)}"
@@ -202,7 +183,7 @@ def _success_text(cell: NetworkSummary) -> str:
     return text
 
 
-def cost_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
+def cost_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
     """Draw the cost of each network: multiply-accumulates, or the latency estimated from them."""
     cells = sweep.of(arena)
     values = [_cost(sweep, cell) for cell in cells]
@@ -234,9 +215,9 @@ def cost_picture(sweep: Sweep, arena: str) -> theme.FigureImage:
 
 
 def _heat_map(
-    sweep: Sweep,
+    sweep: summary.Sweep,
     arena: str,
-    cells: Sequence[NetworkSummary],
+    cells: Sequence[summary.NetworkSummary],
     fields: Sequence[Field],
     **look: Any,
 ) -> HeatMap:
@@ -252,11 +233,11 @@ def _heat_map(
     )
 
 
-def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
+def _cost(sweep: summary.Sweep, cell: summary.NetworkSummary) -> float:
     return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
 
 
-def trade_picture(sweep: Sweep) -> theme.FigureImage:
+def trade_picture(sweep: summary.Sweep) -> theme.FigureImage:
     """Draw success against cost: a dot with its interval for each network."""
     figure = theme.new_figure(7.4, 4.2)
     ax: Axes = figure.subplots()
@@ -300,7 +281,13 @@ def trade_picture(sweep: Sweep) -> theme.FigureImage:
 
 
 def _draw_network(
-    ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
+    ax: Axes,
+    cell: summary.NetworkSummary,
+    x: float,
+    number: int,
+    *,
+    chosen: bool,
+    label: str | None,
 ) -> None:
     """Draw one network of an arena, styled by the arena's number."""
     rate, colour = cell.success_rate, theme.line_style(number).colour
@@ -320,10 +307,10 @@ def _draw_network(
     )
 
 
-def document_of(sweep: Sweep) -> Document:
+def document_of(sweep: summary.Sweep) -> document.Document:
     """Return the page of a sweep with at least one finished trial."""
     sections = [
-        Section(
+        document.Section(
             arena,
             sentences=best_sentences(sweep, arena),
             tables=(networks_table(sweep, arena),),
@@ -331,10 +318,12 @@ def document_of(sweep: Sweep) -> Document:
         )
         for arena in sweep.arenas
     ]
-    trade = Section("Success against cost", draw=lambda: [trade_picture(sweep)], in_terminal=False)
+    trade = document.Section(
+        "Success against cost", draw=lambda: [trade_picture(sweep)], in_terminal=False
+    )
     made = sweep.made
     begun = f"{made['created_utc']}".replace("T", " ").replace("+00:00", " UTC")
-    return Document(
+    return document.Document(
         name="sweep",
         title=sweep.config.description,
         kicker=f"Architecture search · begun {begun} · {sweep.ended} of {sweep.planned} trials",
@@ -345,26 +334,26 @@ def document_of(sweep: Sweep) -> Document:
         facts_title="What was searched",
         provenance=(
             ("command", f"{made['command']}"),
-            *provenance_facts(made["machine"], made["git"], made["versions"]),
+            *document.provenance_facts(made["machine"], made["git"], made["versions"]),
         ),
         configurations=(
-            ("the sweep", json.dumps(as_data(sweep.config), indent=2, ensure_ascii=False)),
+            ("the sweep", json.dumps(summary.as_data(sweep.config), indent=2, ensure_ascii=False)),
         ),
         footer=(
-            f"airl-mav {made['versions'].get('airl-mav', '')} · figures as data in {SWEEP_FILE} "
-            "beside this page; a trial's policy flies with airl-sitl --policy "
-            "trials/<trial>/policy"
+            f"airl-mav {made['versions'].get('airl-mav', '')} · figures as data in "
+            f"{summary.SWEEP_FILE} beside this page; a trial's policy flies with airl-sitl "
+            "--policy trials/<trial>/policy"
         ),
     )
 
 
-def _arena_pictures(sweep: Sweep, arena: str) -> list[FigureImage]:
+def _arena_pictures(sweep: summary.Sweep, arena: str) -> list[FigureImage]:
     return [success_picture(sweep, arena), cost_picture(sweep, arena)]
 
 
-def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
+def best_sentences(sweep: summary.Sweep, arena: str) -> tuple[str, ...]:
     """Return sentences on an arena's best network, its interval, and the published one."""
-    best, published = sweep.best(arena), published_best(arena)
+    best, published = sweep.best(arena), summary.published_best(arena)
     if best is None:
         return ("No trial has ended yet.",)
     n = best.success_rate.n
@@ -385,7 +374,7 @@ def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def sweep_facts(sweep: Sweep) -> Facts:
+def sweep_facts(sweep: summary.Sweep) -> document.Facts:
     """Return the facts of the search."""
     config = sweep.config
     training = training_of(config, trials(config)[0])
@@ -420,12 +409,12 @@ def _listed(numbers: Sequence[int]) -> str:
     return ", ".join(f"{number}" for number in numbers)
 
 
-def _headline(sweep: Sweep, arena: str) -> Headline:
-    best, published = sweep.best(arena), published_best(arena)
+def _headline(sweep: summary.Sweep, arena: str) -> document.Headline:
+    best, published = sweep.best(arena), summary.published_best(arena)
     theirs = ""
     if published is not None:
         theirs = f"; the paper: {published[0]}, {100.0 * published[1]:.0f} %"
     if best is None:
-        return Headline(arena, NONE, "", f"no trial has ended{theirs}")
+        return document.Headline(arena, document.NONE, "", f"no trial has ended{theirs}")
     detail = f"{percent(best.success_rate.value)} % ({interval(best)}){theirs}"
-    return Headline(arena, best.network, "", detail)
+    return document.Headline(arena, best.network, "", detail)

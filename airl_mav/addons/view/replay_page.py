@@ -7,13 +7,8 @@ from typing import Any
 
 import viser
 
+from airl_mav.addons.view import replayed_flight
 from airl_mav.addons.view.panel import Panel
-from airl_mav.addons.view.replayed_flight import (
-    ReplayedFlight,
-    ReplayedRun,
-    ReplayedRuns,
-    parting_s,
-)
 from airl_mav.addons.view.view_messages import Shown
 from airl_mav.addons.view.view_server import Watchers
 from airl_mav.addons.view.viser_scene import FlightScene
@@ -54,10 +49,10 @@ class ReplayPage:
     def __init__(
         self,
         server: viser.ViserServer,
-        run: ReplayedRun,
-        beside: ReplayedRun | None = None,
+        run: replayed_flight.ReplayedRun,
+        beside: replayed_flight.ReplayedRun | None = None,
         first: EpisodeRecord | None = None,
-        runs: ReplayedRuns | None = None,
+        runs: replayed_flight.ReplayedRuns | None = None,
     ) -> None:
         """Build the page at the start of flight `first`; None = the worst flight."""
         self._run, self._beside, self._runs = run, beside, runs
@@ -82,7 +77,7 @@ class ReplayPage:
         self._glides_s = 0.0
         """Remaining time of the transition to the slider's time [wall s]; 0 = no transition."""
         self._drawn = 0
-        self._other: ReplayedFlight | None = None
+        self._other: replayed_flight.ReplayedFlight | None = None
         """Flight of the second run."""
         self._open(run.way(first or run.records[0]))
 
@@ -118,11 +113,14 @@ class ReplayPage:
 
         @self._part.on_click
         def _(_event: object) -> None:
-            if self._other is not None and (at := parting_s(self._flight, self._other)) is not None:
+            if (
+                self._other is not None
+                and (at := replayed_flight.parting_s(self._flight, self._other)) is not None
+            ):
                 self._playing = False
                 self._go_to(at)
 
-    def _add_runs(self, runs: ReplayedRuns) -> None:
+    def _add_runs(self, runs: replayed_flight.ReplayedRuns) -> None:
         now, beside = runs.name_of(self._run), self._beside
         there = ALONE if beside is None else runs.name_of(beside)
         flown = self._gui.add_dropdown("Run", runs.names, initial_value=now)
@@ -151,9 +149,9 @@ class ReplayPage:
 
     # --- position in time
 
-    def _open(self, way: ReplayedFlight) -> None:
+    def _open(self, way: replayed_flight.ReplayedFlight) -> None:
         """Show a flight at once and add its arena when ready; late viewers get both."""
-        self._flight: ReplayedFlight = way
+        self._flight: replayed_flight.ReplayedFlight = way
         way.begin(self._shown)
         self._shown.is_surrounded = False
         self._go_to(self._begin_s())

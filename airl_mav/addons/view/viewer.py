@@ -12,16 +12,7 @@ from typing import Any
 import zmq
 from pydantic import ValidationError
 
-from airl_mav.addons.view.view_messages import (
-    Image,
-    Steering,
-    Told,
-    ViewAnswer,
-    ViewMessage,
-    ViewSettings,
-    from_parts,
-    to_parts,
-)
+from airl_mav.addons.view import view_messages
 from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
@@ -49,7 +40,7 @@ class Pace:
         new_clock: Callable[[float], WallClock] = WallClock,
     ) -> None:
         """Connect to a view; `speed` applies until the view sets another, None = unlimited."""
-        self._steering = Asked(ends, Steering(speed=speed))
+        self._steering = Asked(ends, view_messages.Steering(speed=speed))
         self._new_clock = new_clock
         self._clock: WallClock | None = None
         self._steps: int | None = None
@@ -90,7 +81,7 @@ class Pace:
         """Disconnect."""
         self._steering.close()
 
-    def _heard(self, asked: Steering) -> Steering:
+    def _heard(self, asked: view_messages.Steering) -> view_messages.Steering:
         if self._steps is None or asked.steps < self._steps or not asked.paused:
             # The first request, the count of another view, or no pause: no step is pending.
             self._left = 0
@@ -103,10 +94,12 @@ class Pace:
 MODULE = "airl_mav.addons.view.view_server"
 
 
-def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -> ViewSettings:
+def request_of(
+    scenario: ResolvedScenario, name: str, port: int | None = None
+) -> view_messages.ViewSettings:
     """Return the settings of a view of a scenario's flights; arguments as in `ViewSettings`."""
     paced = scenario.scenario.level == "lockstep"
-    return ViewSettings(
+    return view_messages.ViewSettings(
         run=name,
         port=port,
         paced=paced,
@@ -120,7 +113,7 @@ def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -
 class Viewer:
     """Page that shows flights until closed."""
 
-    def __init__(self, request: ViewSettings) -> None:
+    def __init__(self, request: view_messages.ViewSettings) -> None:
         """Start the viewer and wait for it; raise FieldError if the port is in use."""
         self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
         self._child = ChildProcess(
@@ -142,7 +135,7 @@ class Viewer:
         self.url = f"http://{LOOPBACK}:{answer.port}"
         """URL of the page for a browser."""
 
-    def _answer(self, request: ViewSettings) -> ViewAnswer:
+    def _answer(self, request: view_messages.ViewSettings) -> view_messages.ViewAnswer:
         stdin, stdout = self._child.stdin, self._child.stdout
         line = b""
         if stdin is not None and stdout is not None:
@@ -151,7 +144,7 @@ class Viewer:
                 stdin.flush()
                 line = stdout.readline()
         try:
-            return ViewAnswer.model_validate_json(line)
+            return view_messages.ViewAnswer.model_validate_json(line)
         except ValidationError:
             self._child.stop()
             raise ViewError(f"the view did not start\n{self._child.log_tail()}") from None
@@ -182,10 +175,12 @@ class Feed:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.connect(ends.messages)
 
-    def send(self, message: ViewMessage, image: Image | None = None) -> None:
+    def send(
+        self, message: view_messages.ViewMessage, image: view_messages.Image | None = None
+    ) -> None:
         """Send a message with its image, or drop it."""
         with suppress(zmq.Again):
-            self._socket.send_multipart(to_parts(message, image), zmq.NOBLOCK)
+            self._socket.send_multipart(view_messages.to_parts(message, image), zmq.NOBLOCK)
 
     def close(self) -> None:
         """Disconnect and drop queued messages."""
@@ -196,7 +191,9 @@ class Feed:
 class Asked:
     """Receiver of the viewers' requests. Use from one thread at a time."""
 
-    def __init__(self, ends: ViewAddresses, default: Steering, clock: Clock | None = None) -> None:
+    def __init__(
+        self, ends: ViewAddresses, default: view_messages.Steering, clock: Clock | None = None
+    ) -> None:
         """Connect to the view; `default` applies before its first message and after a timeout."""
         self._clock = clock or WallClock()
         self._heard_us = self._clock.time_us()
@@ -208,11 +205,11 @@ class Asked:
         self._socket.subscribe(b"")
         self._socket.connect(ends.steering)
 
-    def newest(self, wait_s: float = 0.0) -> Steering:
+    def newest(self, wait_s: float = 0.0) -> view_messages.Steering:
         """Return the newest requests, waiting up to `wait_s` [s] for a new message."""
         if self._socket.poll(round(1e3 * wait_s)):
             with suppress(ValidationError):
-                self._newest = Steering.model_validate_json(self._socket.recv())
+                self._newest = view_messages.Steering.model_validate_json(self._socket.recv())
             self._heard_us = self._clock.time_us()
         elif self._clock.time_us() - self._heard_us > SILENCE_S * US_PER_S:
             self._newest = self._default
@@ -243,12 +240,12 @@ class Ends:
         socket.bind(f"tcp://{LOOPBACK}:*")
         return socket
 
-    def take(self, wait_s: float) -> list[tuple[Told, Image | None]]:
+    def take(self, wait_s: float) -> list[tuple[view_messages.Told, view_messages.Image | None]]:
         """Return all received messages, oldest first, waiting up to `wait_s` [s] for the first."""
-        found: list[tuple[Told, Image | None]] = []
+        found: list[tuple[view_messages.Told, view_messages.Image | None]] = []
         wait_ms = round(1e3 * wait_s)
         while self._inbox.poll(wait_ms):
-            read = from_parts(self._inbox.recv_multipart())
+            read = view_messages.from_parts(self._inbox.recv_multipart())
             if read is not None:
                 found.append(read)
             wait_ms = 0
@@ -256,7 +253,7 @@ class Ends:
                 break  # A flight at full speed: draw the received messages first.
         return found
 
-    def ask(self, steering: Steering) -> None:
+    def ask(self, steering: view_messages.Steering) -> None:
         """Publish the requests; call repeatedly so that late subscribers receive them."""
         self._steering.send(steering.model_dump_json().encode(), zmq.NOBLOCK)
 

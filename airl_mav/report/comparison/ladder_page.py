@@ -9,21 +9,11 @@ from typing import Any
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import document
 from airl_mav.report.comparison import tables
 from airl_mav.report.comparison.build import compare, comparison_document, split_seeds, widest_seeds
 from airl_mav.report.comparison.comparison_model import ComparedRun, Comparison, Contrast, RunEntry
 from airl_mav.report.comparison.figures import contrast_pictures
-from airl_mav.report.document import (
-    NONE,
-    OUTCOME_LABELS,
-    Column,
-    Document,
-    Section,
-    TableView,
-    columns_of,
-    ms,
-    tables_section,
-)
 from airl_mav.report.measures import MEASURES, count_successes
 
 MAX_SPLIT = 50
@@ -45,9 +35,9 @@ def build_ladder(
     return replace(comparison, extra={"split": split_seeds(runs), "widest_percent": widest})
 
 
-def start_table(comparison: Comparison) -> TableView:
+def start_table(comparison: Comparison) -> document.TableView:
     """Return the start of navigation and the position error at each level."""
-    columns = columns_of(
+    columns = document.columns_of(
         "<level | flights | take-off [s] | its energy [kJ] | "
         "aside [m] | height [m] | speed [m/s] | position error [m]"
     )
@@ -57,34 +47,37 @@ def start_table(comparison: Comparison) -> TableView:
         "is told, during navigation, seen from above.",
     )
     rows = tuple(_start_row(run) for run in comparison.runs)
-    return TableView("start", "Where navigation begins", columns, rows, notes)
+    return document.TableView("start", "Where navigation begins", columns, rows, notes)
 
 
 def _start_row(run: ComparedRun) -> tuple[str, ...]:
     start, error = run.start, run.position_error_m
-    told = NONE if error is None else f"{error:.2f}"
+    told = document.NONE if error is None else f"{error:.2f}"
     if start is None:
-        return (run.mark, "0", *(NONE,) * 5, told)
+        return (run.mark, "0", *(document.NONE,) * 5, told)
     energy_j = start.takeoff_energy_j
-    energy = NONE if energy_j is None else f"{energy_j / 1e3:.2f}"
+    energy = document.NONE if energy_j is None else f"{energy_j / 1e3:.2f}"
     takeoff = (f"{start.takeoff_s:.2f}", energy)
     if not start.takeoff_s:
-        takeoff = ("none", NONE)
+        takeoff = ("none", document.NONE)
     place = (f"{start.aside_m:.2f}", f"{start.height_m:.2f}", f"{start.speed_m_s:.2f}")
     return (run.mark, f"{start.n:,}", *takeoff, *place, told)
 
 
-def split_table(comparison: Comparison) -> TableView:
+def split_table(comparison: Comparison) -> document.TableView:
     """Return the flights with different outcomes, one seed per row."""
-    columns = (Column("seed"), *(Column(run.mark, number=False) for run in comparison.runs))
+    columns = (
+        document.Column("seed"),
+        *(document.Column(run.mark, number=False) for run in comparison.runs),
+    )
     split = comparison.extra["split"]
     rows = tuple(
         (
             f"{each['seed']}",
             *(
-                OUTCOME_LABELS[Outcome(each["outcomes"][run.name])]
+                document.OUTCOME_LABELS[Outcome(each["outcomes"][run.name])]
                 if run.name in each["outcomes"]
-                else NONE
+                else document.NONE
                 for run in comparison.runs
             ),
         )
@@ -94,7 +87,7 @@ def split_table(comparison: Comparison) -> TableView:
     if len(rows) < len(split):
         notes.append(f"{len(rows)} of {len(split):,}; all: ladder.json.")
     title = "Flights that did not end alike"
-    return TableView("split", title, columns, rows, tuple(notes), in_terminal="not")
+    return document.TableView("split", title, columns, rows, tuple(notes), in_terminal="not")
 
 
 def other_differences(comparison: Comparison) -> tuple[str, ...]:
@@ -108,7 +101,7 @@ def other_differences(comparison: Comparison) -> tuple[str, ...]:
     def mean_of(stage: str) -> Callable[[ComparedRun], str | None]:
         def text(run: ComparedRun) -> str | None:
             mean = run.stages[stage].mean
-            return None if mean is None else f"{ms(mean, 1)} ms"
+            return None if mean is None else f"{document.ms(mean, 1)} ms"
 
         return text
 
@@ -124,8 +117,8 @@ def other_differences(comparison: Comparison) -> tuple[str, ...]:
     for contrast in comparison.contrasts:
         lines += [_pace_sentence(comparison, contrast), _widest_sentence(comparison, contrast)]
     lines += [
-        f"The host could not keep pace at {run.mark}: {ms(run.slipped_us, 0)} ms of simulated "
-        f"time given up over {run.flown:,} flights."
+        f"The host could not keep pace at {run.mark}: {document.ms(run.slipped_us, 0)} ms of "
+        f"simulated time given up over {run.flown:,} flights."
         for run in comparison.runs
         if run.slipped_us
     ]
@@ -171,20 +164,24 @@ def _widest_sentence(comparison: Comparison, contrast: Contrast) -> str:
     )
 
 
-def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+def document_of(
+    comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path
+) -> document.Document:
     """Return the document of a ladder."""
     reference = comparison.runs[0].mark
     contrasts = comparison.contrasts
     levels = tables.runs_table(comparison.runs, title="Levels", head="level", measures=MEASURES)
     split = split_table(comparison)
     sections = [
-        *tables_section(levels),
+        *document.tables_section(levels),
         *(
-            Section(view.title, headlines=tables.contrast_headlines(contrast), tables=(view,))
+            document.Section(
+                view.title, headlines=tables.contrast_headlines(contrast), tables=(view,)
+            )
             for contrast in contrasts
             for view in (tables.contrast_table(comparison, contrast),)
         ),
-        Section(
+        document.Section(
             "Paired differences",
             draw=lambda: contrast_pictures("ladder", comparison, contrasts),
             sheet="ladder.png",
@@ -192,10 +189,10 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
             f"{reference}.",
             in_terminal=False,
         ),
-        *tables_section(tables.stages_table(comparison.runs)),
-        *tables_section(start_table(comparison)),
-        Section("What else differs", sentences=other_differences(comparison)),
-        *tables_section(split if split.rows else None),
+        *document.tables_section(tables.stages_table(comparison.runs)),
+        *document.tables_section(start_table(comparison)),
+        document.Section("What else differs", sentences=other_differences(comparison)),
+        *document.tables_section(split if split.rows else None),
     ]
     hashes = [(f"sha256 at {run.mark}", run.sha256) for run in comparison.runs if run.sha256]
     return comparison_document(

@@ -14,6 +14,7 @@ from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.report import run_verdict
 from airl_mav.report.comparison import (
     comparison_model,
     degradation_page,
@@ -44,15 +45,6 @@ from airl_mav.report.document import (
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
 from airl_mav.report.measures import MEASURES, SUCCESS_RATE, QualityMeasure
 from airl_mav.report.run_figures import flight_pictures
-from airl_mav.report.run_verdict import (
-    OverallVerdict,
-    invalid_flights,
-    join_verdicts,
-    judge_run,
-    requirements_of,
-    save_verdict,
-    unchecked,
-)
 
 Runs = Mapping[str, LoadedRun]
 
@@ -83,7 +75,7 @@ def rebuild_comparison(folder: Path) -> tuple[comparison_model.Comparison, dict[
 
 def judge_comparison(
     comparison: comparison_model.Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
-) -> OverallVerdict:
+) -> run_verdict.OverallVerdict:
     """Return the verdict of a comparison; raise FieldError for a required gap without a reference.
 
     The verdict on a hardware gap judges the run to deploy: the mitigated policy on the onboard
@@ -97,7 +89,7 @@ def judge_comparison(
         contrast = against.get(run.name)
         reference = "" if contrast is None else comparison.run(contrast.entry.reference).label
         episodes = loaded[run.name].episodes
-        part = judge_run(
+        part = run_verdict.judge_run(
             run.setup,
             run.quality,
             episodes,
@@ -109,12 +101,12 @@ def judge_comparison(
             reached = reached_goals(episodes)
             part = replace(part, findings=tuple(settle(each, reached) for each in part.findings))
         parts.append(part)
-    verdict = join_verdicts(parts, f"{len(parts)} runs")
+    verdict = run_verdict.join_verdicts(parts, f"{len(parts)} runs")
     # All compared runs must be valid, not only the judged runs.
-    invalid = {name: invalid_flights(run.episodes) for name, run in loaded.items()}
+    invalid = {name: run_verdict.invalid_flights(run.episodes) for name, run in loaded.items()}
     lines = tuple(f"{name}, {line}" for name, flights in invalid.items() for line in flights)
     sentences = comparison.answers or verdict.sentences
-    sentences += unchecked([run.info for run in loaded.values()])
+    sentences += run_verdict.unchecked([run.info for run in loaded.values()])
     return replace(verdict, sentences=sentences, invalid=lines)
 
 
@@ -133,7 +125,7 @@ def write_comparison(
     comparison: comparison_model.Comparison,
     loaded: Runs,
     folder: Path,
-    verdict: OverallVerdict | None = None,
+    verdict: run_verdict.OverallVerdict | None = None,
 ) -> Path:
     """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and PNG files; return the page's path."""
     return write_document(_saved(comparison, loaded, folder, verdict), folder)
@@ -143,20 +135,23 @@ def _saved(
     comparison: comparison_model.Comparison,
     loaded: Runs,
     folder: Path,
-    verdict: OverallVerdict | None,
+    verdict: run_verdict.OverallVerdict | None,
 ) -> Document:
     """Write the data and the verdict of a comparison; return its document."""
-    verdict = verdict or judge_comparison(comparison, loaded, requirements_of(folder))
+    verdict = verdict or judge_comparison(comparison, loaded, run_verdict.requirements_of(folder))
     try:
         comparison_model.save_comparison(comparison, folder)
-        save_verdict(verdict, folder)
+        run_verdict.save_verdict(verdict, folder)
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}") from None
     return comparison_to_document(comparison, loaded, folder, verdict)
 
 
 def comparison_to_document(
-    comparison: comparison_model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
+    comparison: comparison_model.Comparison,
+    loaded: Runs,
+    folder: Path,
+    verdict: run_verdict.OverallVerdict,
 ) -> Document:
     """Return the document of a comparison without drawing its pictures."""
     document = _KINDS[comparison.kind][1](comparison, loaded, folder)
@@ -168,7 +163,7 @@ def show_comparison(
     loaded: Runs,
     folder: Path,
     console: Console,
-    verdict: OverallVerdict | None = None,
+    verdict: run_verdict.OverallVerdict | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Print a comparison, write its files as `write_comparison`, and print the page's path."""

@@ -23,15 +23,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from airl_mav.core.clock import Clock, utc_us
 from airl_mav.core.errors import FieldError, UsageError
+from companion.addons.cameras import rosbag
 from companion.addons.cameras.drivers import DepthImage, Silence
-from companion.addons.cameras.rosbag import (
-    CAMERA_INFO,
-    IMAGE,
-    age_us,
-    depth_mm,
-    info_topic,
-    lens_of,
-)
 
 DESCRIBED_S = 5.0
 """Timeout of the camera's description [s]. ROS 2 nodes discover each other within a second."""
@@ -78,7 +71,7 @@ RegionOfInterest = _message(
     },
 )
 Image = _message(
-    IMAGE,
+    rosbag.IMAGE,
     {
         "header": Header,
         "height": uint32,
@@ -90,7 +83,7 @@ Image = _message(
     },
 )
 CameraInfo = _message(
-    CAMERA_INFO,
+    rosbag.CAMERA_INFO,
     {
         "header": Header,
         "height": uint32,
@@ -115,7 +108,7 @@ class Ros2Camera:
         self._utc_now_us, self._silence = utc_now_us, Silence()
         self._participant = _participant()
         # The camera_info topic stands beside the image topic (ROS convention).
-        described = info_topic(topic)
+        described = rosbag.info_topic(topic)
         about = self._reader(described, CameraInfo)
         info = _next(about, DESCRIBED_S)
         name = f"ros2:{topic}"
@@ -127,7 +120,7 @@ class Ros2Camera:
                 f" (ROS_DOMAIN_ID {_domain()})",
             )
         try:
-            self.lens = lens_of(info, topic)
+            self.lens = rosbag.lens_of(info, topic)
             """Lens described by the first camera_info."""
         except ValueError as error:
             raise FieldError("camera", name, problem=f"{described}: {error}") from None
@@ -146,7 +139,7 @@ class Ros2Camera:
             self._silence.lasted(timeout_s)
             return None
         self._silence.broken()
-        return DepthImage(depth_mm(message), age_us(message, self._utc_now_us()))
+        return DepthImage(rosbag.depth_mm(message), rosbag.age_us(message, self._utc_now_us()))
 
     def close(self) -> None:
         """Leave the domain by releasing the participant and its readers."""

@@ -17,6 +17,7 @@ from typing import NamedTuple
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
+from firmware_sim import interfaces
 from firmware_sim.addons.ardupilot.program import (
     OBSERVER_PORT,
     PORTS_PER_INSTANCE,
@@ -29,13 +30,6 @@ from firmware_sim.addons.ardupilot.program import (
 from firmware_sim.external.flight_stack import FirmwareRequest, instance_endpoint
 from firmware_sim.external.launcher import Launcher, WorkingFolders, no_process
 from firmware_sim.external.parameters import refuse_untold
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    FirmwareLostError,
-    FirmwareMissingError,
-    SensorSample,
-    TrueState,
-)
 from firmware_sim.mavlink.endpoint import Address, Endpoint
 
 MAGIC_16, MAGIC_32 = 18_458, 29_569
@@ -78,7 +72,7 @@ AWAY_FROM_ZERO = 1.0 + 1e-8
 832.9999 instead of 833 would lose a thousandth of its time."""
 
 
-def state_line(time_us: int, sample: SensorSample, truth: TrueState) -> bytes:
+def state_line(time_us: int, sample: interfaces.SensorSample, truth: interfaces.TrueState) -> bytes:
     """Return the reply to a servo packet: one line, with a line feed before and after.
 
     ArduPilot finds keys by substring and then reads with sscanf. A key's colon and bracket must be
@@ -137,7 +131,7 @@ class ArdupilotBridge:
         """Number of consecutive invalid datagrams."""
         self._silence_us = int(silence_s * US_PER_S)
         self._alive: Callable[[], None] = no_process
-        self._truth: Callable[[], TrueState] | None = None
+        self._truth: Callable[[], interfaces.TrueState] | None = None
         self._address: Address | None = None
         self._packet: ServoPacket | None = None
         """Newest packet, answered by the next line."""
@@ -166,20 +160,20 @@ class ArdupilotBridge:
         while self._packet is None:
             alive()
             if stopwatch.time_us() > timeout_s * US_PER_S:
-                raise FirmwareMissingError(self._not_connected(timeout_s))
+                raise interfaces.FirmwareMissingError(self._not_connected(timeout_s))
             self._packet = self._receive()
         self.rate_hz = self._packet.frame_rate_hz
         if self.rate_hz not in RATES_HZ:
-            raise FirmwareMissingError(
+            raise interfaces.FirmwareMissingError(
                 f"ArduPilot asks for {self.rate_hz} Hz (SIM_RATE_HZ): must be in "
                 f"{RATES_HZ.start}..{RATES_HZ.stop - 1}"
             )
 
-    def use_truth(self, truth: Callable[[], TrueState]) -> None:
+    def use_truth(self, truth: Callable[[], interfaces.TrueState]) -> None:
         """Set the source of the true state, from which ArduPilot simulates its other sensors."""
         self._truth = truth
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Answer the pending packet and return the next packet's motor commands; see `Bridge`.
 
         Outputs 1 to 4 of ArduCopter's quad X (FRAME_TYPE 1) are PX4's motors: front right, rear
@@ -198,7 +192,7 @@ class ArdupilotBridge:
         self._packet = packet = self._next(answered, line)
         motors = _motors(packet.pwm_us)
         self.armed = any(motors)
-        return ActuatorControls(sample.time_us, motors, self.armed)
+        return interfaces.ActuatorControls(sample.time_us, motors, self.armed)
 
     def close(self) -> None:
         """Close the port."""
@@ -229,9 +223,9 @@ class ArdupilotBridge:
             silent_us = stopwatch.time_us()
             self._alive()
             if self._newcomer and silent_us >= NEWCOMER_S * US_PER_S:
-                raise FirmwareLostError(_RESTARTED)
+                raise interfaces.FirmwareLostError(_RESTARTED)
             if silent_us >= self._silence_us:
-                raise FirmwareLostError(
+                raise interfaces.FirmwareLostError(
                     f"ArduPilot has sent no servo packet for {self._silence_us / US_PER_S:g} s"
                 )
             if repeated and self._address is not None:
@@ -264,7 +258,7 @@ class ArdupilotBridge:
         self.garbage += 1
         self._run += 1
         if self._run >= MAX_GARBAGE and self._address is not None:
-            raise FirmwareLostError(
+            raise interfaces.FirmwareLostError(
                 f"{self._run} consecutive datagrams are not servo packets: {error}"
             )
 
@@ -284,7 +278,7 @@ _RESTARTED = "ArduPilot restarted during an episode"
 def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
     """Return `after`. Raises FirmwareLostError if its frame count went back."""
     if after.frame_count < before.frame_count:
-        raise FirmwareLostError(_RESTARTED)
+        raise interfaces.FirmwareLostError(_RESTARTED)
     return after
 
 

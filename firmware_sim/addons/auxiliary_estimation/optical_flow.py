@@ -16,12 +16,8 @@ import numpy as np
 
 from airl_mav.core.constants import MS_PER_S, TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, quat_to_matrix
+from firmware_sim.addons.auxiliary_estimation import sensors
 from firmware_sim.addons.auxiliary_estimation.range_finder import RangeFinder
-from firmware_sim.addons.auxiliary_estimation.sensors import (
-    GREATEST_HEIGHT_M,
-    GREATEST_RAD_S,
-    LEAST_HEIGHT_M,
-)
 from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND, reset_variances
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
@@ -176,7 +172,7 @@ class OpticalFlowFusion:
         fast = max(math.hypot(*rate.tolist()), math.hypot(*compensated.tolist()))
         good = (
             reading.quality >= least_quality
-            and fast <= GREATEST_RAD_S
+            and fast <= sensors.GREATEST_RAD_S
             and self._rotation[2, 2] > _COS_GREATEST_TILT
         )
         if good:
@@ -184,7 +180,7 @@ class OpticalFlowFusion:
             self._smooth(compensated)
         # Height by terrain and estimate, not by the newest range.
         height = self._terrain.down - self._state.item(es.P + 2)
-        possible = LEAST_HEIGHT_M <= height <= GREATEST_HEIGHT_M
+        possible = sensors.LEAST_HEIGHT_M <= height <= sensors.GREATEST_HEIGHT_M
         tells_ground = not ground.is_reference
         if not possible:
             self._stop()

@@ -16,15 +16,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import OpticalFlow, Rangefinder, Vision
-from airl_mav.vehicle.rotation import (
-    Quat,
-    Vec,
-    conjugate,
-    exponential,
-    multiply,
-    rotate,
-    yaw_of,
-)
+from airl_mav.vehicle import rotation
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, VELOCITY, quaternion, rates, velocity
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry
 from firmware_sim.plant.sensors import SimulatedSensor, Site
@@ -42,7 +34,7 @@ _ENDLESS = Bounds(-1e6, 1e6, -1e6, 1e6, 1.0)
 class DownwardRay:
     """Ray that finds ground, walls and obstacles, including moving obstacles and meshes."""
 
-    def __init__(self, place: Vec, greatest_m: float, arena: Arena | None) -> None:
+    def __init__(self, place: rotation.Vec, greatest_m: float, arena: Arena | None) -> None:
         """Mount the ray at a place in the vehicle, FRD [m], with a maximum range [m]."""
         self._arena, self._mount = arena, Mount(place, _DOWN)
         self._lens = LensConstants(_FOCAL_PX, 0.0, 0.0, greatest_m)
@@ -78,7 +70,7 @@ VALID, INVALID = 100, 0
 """Quality of a range within the limits, and of all others [%]."""
 
 
-def _place_of(profile: Rangefinder | OpticalFlow) -> Vec:
+def _place_of(profile: Rangefinder | OpticalFlow) -> rotation.Vec:
     return profile.forward_m, profile.right_m, profile.down_m
 
 
@@ -116,7 +108,7 @@ _TURN_X, _TURN_Y, _WAY_X, _WAY_Y, _TIME, _SIZE = 0, 1, 2, 3, 4, 5
 def _pass(row: Vector, place: Vector, tick_s: float, since: Vector) -> None:
     """Add a tick that ends in motion `row` (16,) to the sums (5,) of a sensor at a place (3,)."""
     # Flow is measured in body axes, at the sensor's place: v + w x r.
-    v, w = rotate(conjugate(quaternion(row)), velocity(row)), rates(row)
+    v, w = rotation.rotate(rotation.conjugate(quaternion(row)), velocity(row)), rates(row)
     since[_TURN_X] += w[0] * tick_s
     since[_TURN_Y] += w[1] * tick_s
     since[_WAY_X] += (v[0] + w[1] * place[2] - w[2] * place[1]) * tick_s
@@ -174,7 +166,7 @@ class PlantVision(SimulatedSensor):
 
     def __init__(self, profile: Vision, site: Site) -> None:
         super().__init__(profile, site)
-        self._start: tuple[Vector, Quat] | None = None
+        self._start: tuple[Vector, rotation.Quat] | None = None
         """Position, and the level frame with the vehicle's heading, at the first pose."""
         self._last = np.zeros(3)
         self._drift = np.zeros(3)
@@ -197,7 +189,7 @@ class PlantVision(SimulatedSensor):
         profile, white, times = self.profile, self.white(), self.site.times
         place, velocity, attitude = row[POSITION], row[VELOCITY], quaternion(row)
         if self._start is None:
-            yaw = 0.5 * yaw_of(attitude)
+            yaw = 0.5 * rotation.yaw_of(attitude)
             self._start = place.copy(), (math.cos(yaw), 0.0, 0.0, math.sin(yaw))
             self._last = place.copy()
         start, frame = self._start
@@ -211,15 +203,17 @@ class PlantVision(SimulatedSensor):
         self._turned += walk * white.item(3)
         half = 0.5 * self._turned
         # From NED into the drifted start frame.
-        into = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), conjugate(frame))
-        seen = rotate(into, tuple(place - start))
-        moving = rotate(into, tuple(velocity))
+        into = rotation.multiply(
+            (math.cos(half), 0.0, 0.0, math.sin(half)), rotation.conjugate(frame)
+        )
+        seen = rotation.rotate(into, tuple(place - start))
+        moving = rotation.rotate(into, tuple(velocity))
         # Attitude noise is a small rotation.
-        error = exponential(tuple(times * profile.angle_noise_rad * white[4:7]))
+        error = rotation.exponential(tuple(times * profile.angle_noise_rad * white[4:7]))
         return Odometry(
             np.array(seen) + self._drift + times * profile.position_noise_m * white[7:10],
             np.array(moving) + times * profile.velocity_noise_m_s * white[10:13],
-            np.array(multiply(multiply(into, attitude), error)),
+            np.array(rotation.multiply(rotation.multiply(into, attitude), error)),
             "frd",
             "frd",
             # Reported variances are the profile's, without the factor `times`.

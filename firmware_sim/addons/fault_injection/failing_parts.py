@@ -25,19 +25,10 @@ from airl_mav.faults import MOTORS, NOISE_SEED, SENSORS, Fault, gust_share
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Battery, Sensors, VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
+from firmware_sim import interfaces
 from firmware_sim.engine.dynamics import Speeds
 from firmware_sim.engine.ticks import PA_PER_HPA
 from firmware_sim.fault_timeline import Acting, FaultTimeline
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    BatterySample,
-    DistanceReading,
-    FlightController,
-    FlowReading,
-    GpsFix,
-    Odometry,
-    SensorSample,
-)
 from firmware_sim.plant.camera import OnboardCamera
 from firmware_sim.plant.plant import Blowing, Plant
 
@@ -65,8 +56,8 @@ def _share(fault: Fault) -> float:
 
 
 def weakened(
-    controls: ActuatorControls, left: Mapping[int, float], thrust_curve: float
-) -> ActuatorControls:
+    controls: interfaces.ActuatorControls, left: Mapping[int, float], thrust_curve: float
+) -> interfaces.ActuatorControls:
     """Return commands that give healthy motors the thrust of failing motors.
 
     `left` is the remaining share of thrust of each failing motor, by index. A share above 1 raises
@@ -81,12 +72,12 @@ def weakened(
 
 
 def slowed(
-    controls: ActuatorControls,
+    controls: interfaces.ActuatorControls,
     slow: Mapping[int, float],
     speeds: Sequence[float],
     lag: float,
     thrust_curve: float,
-) -> ActuatorControls:
+) -> interfaces.ActuatorControls:
     """Return commands that give healthy motors the speeds of slow motors.
 
     Over a tick, a motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed error, a
@@ -103,7 +94,9 @@ def slowed(
     return controls._replace(motors=(first, second, third, fourth))
 
 
-def misread(reading: BatterySample, acting: Sequence[Acting], battery: Battery) -> BatterySample:
+def misread(
+    reading: interfaces.BatterySample, acting: Sequence[Acting], battery: Battery
+) -> interfaces.BatterySample:
     """Return the reading of a failing battery: empty if `off`, a lower voltage by `sag`."""
     for _, fault, *_ in acting:
         if fault.kind == "off":
@@ -205,22 +198,22 @@ class Noisy:
             return None
         error = self.sd * self.rng.standard_normal(len(self.sd))
         moved = shifted(value, error[:3])
-        if isinstance(moved, GpsFix):
+        if isinstance(moved, interfaces.GpsFix):
             return moved._replace(velocity_ned=moved.velocity_ned + error[3:])
-        if isinstance(moved, Odometry) and moved.velocity is not None:
+        if isinstance(moved, interfaces.Odometry) and moved.velocity is not None:
             return moved._replace(velocity=moved.velocity + error[3:])
         return moved
 
 
 def shifted(value: Any, offset: Vector) -> Any:
     """Return a measured value with an error: NED for a fix, the pose's frame for a pose."""
-    if isinstance(value, GpsFix):
+    if isinstance(value, interfaces.GpsFix):
         return value._replace(position=local_to_geodetic(offset, value.position))
-    if isinstance(value, Odometry):
+    if isinstance(value, interfaces.Odometry):
         return value if value.position is None else value._replace(position=value.position + offset)
-    if isinstance(value, DistanceReading):
+    if isinstance(value, interfaces.DistanceReading):
         return farther(value, offset.item(0))
-    if isinstance(value, FlowReading):
+    if isinstance(value, interfaces.FlowReading):
         error = offset * value.interval_s if value.quality > 0 else 0.0
         return value._replace(flow=value.flow + error)
     if isinstance(value, float):
@@ -228,7 +221,7 @@ def shifted(value: Any, offset: Vector) -> Any:
     return value + offset
 
 
-def farther(reading: DistanceReading, error_m: float) -> DistanceReading:
+def farther(reading: interfaces.DistanceReading, error_m: float) -> interfaces.DistanceReading:
     """Return a range with an error, with quality 0 if it is outside the sensor's limits."""
     if reading.quality == 0:
         return reading
@@ -280,7 +273,9 @@ def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Ge
     return Noisy(more * noise_sd(part, profile, tick_s), rng)
 
 
-def failed(sample: SensorSample, effects: list[tuple[str, Effect]]) -> SensorSample:
+def failed(
+    sample: interfaces.SensorSample, effects: list[tuple[str, Effect]]
+) -> interfaces.SensorSample:
     """Return a sample with all effects, given with sensor names, applied in order."""
     changed: dict[str, Any] = {}
     for part, effect in effects:
@@ -326,7 +321,7 @@ class FailingParts:
 
     def __init__(
         self,
-        controller: FlightController,
+        controller: interfaces.FlightController,
         plant: Plant,
         vehicle: VehicleProfile,
         timeline: FaultTimeline,
@@ -355,7 +350,7 @@ class FailingParts:
         self._dropped: set[int] = set()
         timeline.on_change(self._rearrange)
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Advance the flight controller by the altered sample; return effective motor commands."""
         self._timeline.update(sample.time_us, self._controller.flight)
         if self._effects:

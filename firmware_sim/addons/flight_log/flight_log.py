@@ -9,6 +9,7 @@ from typing import Any, BinaryIO, cast
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
+from firmware_sim import interfaces
 from firmware_sim.addons.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
 from firmware_sim.addons.flight_log.ulog_writer import UlogWriter, Values
 from firmware_sim.autopilot import error_state as es
@@ -18,24 +19,16 @@ from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.snapshot import AutopilotState, setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
-from firmware_sim.interfaces import (
-    ULOG_SUFFIX,
-    BatterySample,
-    LogEntry,
-    LogStore,
-    OpenLog,
-    TrueState,
-)
 
 # ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
 
 
-def truth_of(tick: Any) -> TrueState:
+def truth_of(tick: Any) -> interfaces.TrueState:
     """Return the true state of a tick of an aircraft (`engine.record.TRUE_TICK`)."""
     row = tick["motion"].copy()
     power_w, charge = float(tick["power_w"]), float(tick["charge"])
     parts = row[POSITION], row[VELOCITY], row[QUATERNION], row[RATES]
-    return TrueState(int(tick["time_us"]), *parts, power_w, charge)
+    return interfaces.TrueState(int(tick["time_us"]), *parts, power_w, charge)
 
 
 class FlownState:
@@ -85,7 +78,7 @@ class FlownState:
     pressure_hpa = property(lambda self: self._tick["pressure_hpa"].item())
     temperature_c = property(lambda self: self._tick["temperature_c"].item())
     motors = property(lambda self: tuple(self._tick["motors"].tolist()))
-    battery = property(lambda self: BatterySample(*self._tick["battery"].tolist()))
+    battery = property(lambda self: interfaces.BatterySample(*self._tick["battery"].tolist()))
 
     def _output(self, first: int, end: int) -> Vector:
         values: Vector = self._tick["output"][first:end].copy()
@@ -212,7 +205,7 @@ OPEN_FILES = 8
 """Maximum number of log files kept open for downloads, which read a few bytes per tick."""
 
 
-class LogFolder(LogStore):
+class LogFolder(interfaces.LogStore):
     """Complete logs by name, then the open log; rescans changed folders."""
 
     def __init__(self, folder: Path, current: UlogFlightLog) -> None:
@@ -225,12 +218,12 @@ class LogFolder(LogStore):
         self._files: OrderedDict[Path, BinaryIO] = OrderedDict()
         """Open files; the most recently read file is last."""
 
-    def entries(self) -> Sequence[LogEntry]:
+    def entries(self) -> Sequence[interfaces.LogEntry]:
         """Return the logs; the log currently written is last."""
         entries = [_entry(path) for path in self._completed()]
         if not self._current.writer.closed:
             began_s = self._current.began_unix_us // US_PER_S
-            entries.append(LogEntry(began_s, self._current.writer.size_bytes))
+            entries.append(interfaces.LogEntry(began_s, self._current.writer.size_bytes))
         return entries
 
     def read(self, number: int, offset: int, count: int) -> bytes:
@@ -251,12 +244,12 @@ class LogFolder(LogStore):
         except OSError:
             return b""  # removed by another program
 
-    def open_log(self) -> OpenLog | None:
+    def open_log(self) -> interfaces.OpenLog | None:
         """Return the log currently written; None = no open log."""
         log = self._current.writer
         if log.closed:
             return None
-        return OpenLog(len(self._completed()), log.head_bytes, log.size_bytes)
+        return interfaces.OpenLog(len(self._completed()), log.head_bytes, log.size_bytes)
 
     def close(self) -> None:
         """Close all files open for downloads. Idempotent."""
@@ -268,7 +261,7 @@ class LogFolder(LogStore):
         if state != self._scanned:
             self.close()
             self._scanned = state
-            self._complete = sorted(self._folder.glob(f"*{ULOG_SUFFIX}"))
+            self._complete = sorted(self._folder.glob(f"*{interfaces.ULOG_SUFFIX}"))
         return self._complete
 
     def _opened(self, path: Path) -> BinaryIO:
@@ -281,12 +274,12 @@ class LogFolder(LogStore):
         return file
 
 
-def _entry(path: Path) -> LogEntry:
+def _entry(path: Path) -> interfaces.LogEntry:
     try:
         stat = path.stat()
     except OSError:
-        return LogEntry(0, 0)  # removed by another program
-    return LogEntry(int(stat.st_mtime), stat.st_size)
+        return interfaces.LogEntry(0, 0)  # removed by another program
+    return interfaces.LogEntry(int(stat.st_mtime), stat.st_size)
 
 
 def open_flight_log(

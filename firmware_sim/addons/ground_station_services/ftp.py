@@ -11,27 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.addons.ground_station_services import component_metadata
-from firmware_sim.addons.ground_station_services.files import (
-    CHUNK_BYTES,
-    DATA_BYTES,
-    OPERATIONS,
-    SESSION,
-    Code,
-    FtpRequest,
-    RefusedError,
-    Session,
-    Storage,
-    read_at,
-)
+from firmware_sim.addons.ground_station_services import component_metadata, files
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, crc32part
-from firmware_sim.mavlink.services import (
-    Context,
-    Handlers,
-    ServiceState,
-    for_vehicle_or_all,
-    sender,
-)
 
 _HEADER = struct.Struct("<HBBBBBxI")
 """Header: sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
@@ -64,7 +46,7 @@ class Burst:
 class Checksum:
     """CRC-32 of a file, computed in parts: a large file takes longer than a tick."""
 
-    def __init__(self, request: FtpRequest, path: Path) -> None:
+    def __init__(self, request: files.FtpRequest, path: Path) -> None:
         """Open the file. Raises OSError."""
         self.request = request
         self._crc = 0
@@ -72,10 +54,10 @@ class Checksum:
 
     def next_part(self) -> bytes | None:
         """Read the next part; return the reply's data after the last. Raises OSError."""
-        chunk = self._file.read(CHUNK_BYTES)
+        chunk = self._file.read(files.CHUNK_BYTES)
         self._crc = crc32part(chunk, self._crc)
         # A full chunk means that more data may follow, possibly empty.
-        return None if len(chunk) == CHUNK_BYTES else self._crc.to_bytes(4, "little")
+        return None if len(chunk) == files.CHUNK_BYTES else self._crc.to_bytes(4, "little")
 
     def close(self) -> None:
         """Close the file. Repeated calls have no effect."""
@@ -83,10 +65,10 @@ class Checksum:
 
 
 @dataclass(slots=True)
-class FtpClient(ServiceState):
+class FtpClient(services.ServiceState):
     """FTP state of one client."""
 
-    session: Session = field(default_factory=Session)
+    session: files.Session = field(default_factory=files.Session)
     burst: Burst | None = None
     checksum: Checksum | None = None
     used_us: int = 0
@@ -110,7 +92,7 @@ class FtpClient(ServiceState):
             self.checksum = None
 
 
-def handle_request(message: WireMessage, context: Context) -> bool:
+def handle_request(message: WireMessage, context: services.Context) -> bool:
     """Execute a request and reply."""
     payload = bytes(message.payload)
     sequence, session, opcode, size, _, _, offset = _HEADER.unpack_from(payload)
@@ -120,7 +102,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     client = context.state(FtpClient)
     # The client repeats a request whose reply was lost: resend, do not execute twice.
     if sequence == client.last_sequence:
-        _send(client.last_answer, sender(message), context)
+        _send(client.last_answer, services.sender(message), context)
         return True
     if client.checksum is not None and client.checksum.request.sequence == sequence:
         return True  # repeated while the checksum is running
@@ -130,11 +112,13 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
         client.session.close()
     client.used_us = context.now_us
-    data = payload[_HEADER.size :][: min(size, DATA_BYTES)]
-    request = FtpRequest(sequence, session, opcode, offset, size, data, sender(message))
+    data = payload[_HEADER.size :][: min(size, files.DATA_BYTES)]
+    request = files.FtpRequest(
+        sequence, session, opcode, offset, size, data, services.sender(message)
+    )
     try:
-        if size > DATA_BYTES:
-            raise RefusedError(Code.INVALID_DATA_SIZE)
+        if size > files.DATA_BYTES:
+            raise files.RefusedError(files.Code.INVALID_DATA_SIZE)
         # A burst read has no separate reply: `send_pending` sends the data.
         if opcode == _BURST:
             client.session.opened(request)
@@ -142,14 +126,14 @@ def handle_request(message: WireMessage, context: Context) -> bool:
             return True
         # Checksums of large files take several ticks.
         if opcode == _CRC32:
-            storage = context.vehicle_state(Storage)
+            storage = context.vehicle_state(files.Storage)
             component_metadata.provide(storage)
             client.checksum = Checksum(request, storage.path(request.name))
             client.burst = None
             _continue_checksum(client.checksum, context)
             return True
         answer, kind = _execute(request, context), _ACK
-    except (RefusedError, OSError) as error:
+    except (files.RefusedError, OSError) as error:
         answer, kind = _error(error), _NAK
     # Any other request ends a burst.
     client.burst = None
@@ -157,12 +141,12 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _answer(request: FtpRequest, kind: int, answer: bytes, context: Context) -> None:
+def _answer(request: files.FtpRequest, kind: int, answer: bytes, context: services.Context) -> None:
     client = context.state(FtpClient)
     sequence = (request.sequence + 1) & 0xFFFF
     # As in PX4: the client's session number, except after opening a session.
     opened = kind == _ACK and request.opcode in _OPENS
-    session = SESSION if opened else request.session
+    session = files.SESSION if opened else request.session
     body = _packed(sequence, session, kind, request.opcode, request.offset, answer)
     small = len(answer) <= _SMALL_BYTES
     # Large replies are not kept: the client reads again by offset.
@@ -170,7 +154,7 @@ def _answer(request: FtpRequest, kind: int, answer: bytes, context: Context) -> 
     _send(body, request.sender, context)
 
 
-def _continue_checksum(checksum: Checksum, context: Context) -> None:
+def _continue_checksum(checksum: Checksum, context: services.Context) -> None:
     """Continue a checksum, and reply when it is complete."""
     kind = _ACK
     try:
@@ -182,7 +166,7 @@ def _continue_checksum(checksum: Checksum, context: Context) -> None:
         _answer(checksum.request, kind, answer, context)
 
 
-def send_pending(context: Context) -> None:
+def send_pending(context: services.Context) -> None:
     """Send the next messages of a burst, or continue a checksum; call once per tick."""
     client = context.states.get(FtpClient)
     if client is None:
@@ -199,39 +183,41 @@ def send_pending(context: Context) -> None:
         kind, offset, file = _ACK, burst.offset, client.session.file
         try:
             if file is None:
-                raise RefusedError(Code.INVALID_SESSION)
-            data = read_at(file, offset, DATA_BYTES)
+                raise files.RefusedError(files.Code.INVALID_SESSION)
+            data = files.read_at(file, offset, files.DATA_BYTES)
             burst.offset += len(data)
         # END_OF_FILE as a NAK ends the burst, as the protocol requires.
-        except (RefusedError, OSError) as error:
+        except (files.RefusedError, OSError) as error:
             data, kind, client.burst = _error(error), _NAK, None
-        body = _packed(burst.sequence, SESSION, kind, _BURST, offset, data)
+        body = _packed(burst.sequence, files.SESSION, kind, _BURST, offset, data)
         burst.sequence = (burst.sequence + 1) & 0xFFFF
         client.used_us = context.now_us
         _send(body, burst.receiver, context)
 
 
-def _execute(request: FtpRequest, context: Context) -> bytes:
-    operation = OPERATIONS.get(request.opcode)
+def _execute(request: files.FtpRequest, context: services.Context) -> bytes:
+    operation = files.OPERATIONS.get(request.opcode)
     if operation is None:
-        raise RefusedError(Code.UNKNOWN_COMMAND)
-    component_metadata.provide(context.vehicle_state(Storage))
-    return operation(request, context.state(FtpClient).session, context.vehicle_state(Storage))
+        raise files.RefusedError(files.Code.UNKNOWN_COMMAND)
+    component_metadata.provide(context.vehicle_state(files.Storage))
+    return operation(
+        request, context.state(FtpClient).session, context.vehicle_state(files.Storage)
+    )
 
 
-def _error(error: RefusedError | OSError) -> bytes:
+def _error(error: files.RefusedError | OSError) -> bytes:
     """Return the data of a NAK."""
-    if isinstance(error, RefusedError):
+    if isinstance(error, files.RefusedError):
         return bytes([error.code])
     # Codes with a name come first; other errors carry their errno.
     number = error.errno or 0
     code = {
-        errno.EEXIST: Code.FILE_EXISTS,
-        errno.ENOENT: Code.FILE_NOT_FOUND,
-        errno.EACCES: Code.FILE_PROTECTED,
-        errno.ELOOP: Code.FILE_PROTECTED,
+        errno.EEXIST: files.Code.FILE_EXISTS,
+        errno.ENOENT: files.Code.FILE_NOT_FOUND,
+        errno.EACCES: files.Code.FILE_PROTECTED,
+        errno.ELOOP: files.Code.FILE_PROTECTED,
     }.get(number)
-    return bytes([Code.FAIL_ERRNO, number & 0xFF]) if code is None else bytes([code])
+    return bytes([files.Code.FAIL_ERRNO, number & 0xFF]) if code is None else bytes([code])
 
 
 def _packed(sequence: int, session: int, kind: int, opcode: int, offset: int, data: bytes) -> bytes:
@@ -240,7 +226,7 @@ def _packed(sequence: int, session: int, kind: int, opcode: int, offset: int, da
     return (header + data).ljust(_PAYLOAD_BYTES, b"\0")
 
 
-def _send(body: bytes, receiver: tuple[int, int], context: Context) -> None:
+def _send(body: bytes, receiver: tuple[int, int], context: services.Context) -> None:
     network = 0
     context.link.send_payload("FILE_TRANSFER_PROTOCOL", bytes((network, *receiver)) + body)
 
@@ -248,4 +234,6 @@ def _send(body: bytes, receiver: tuple[int, int], context: Context) -> None:
 # --- MAVLink FTP
 
 
-HANDLERS: Handlers = {"FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, handle_request)}
+HANDLERS: services.Handlers = {
+    "FILE_TRANSFER_PROTOCOL": (services.for_vehicle_or_all, handle_request)
+}

@@ -12,23 +12,13 @@ import math
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import local_to_geodetic, quat_yaw
+from firmware_sim.autopilot import flight_modes
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.flight_modes import (
-    BY_CUSTOM_MODE,
-    Mode,
-    ModeSpec,
-)
 from firmware_sim.autopilot.snapshot import AutopilotState
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services import (
-    Action,
-    Context,
-    Handlers,
-    VehicleCommand,
-    for_vehicle_or_all,
-)
 from firmware_sim.mavlink.streams import Builder, no_content, units
 from firmware_sim.mavlink.streams.sensors import scaled_pressure
 from firmware_sim.mavlink.streams.status import NO_MISSION, base_mode
@@ -114,7 +104,7 @@ def _failures(state: AutopilotState) -> int:
     """Return the HL_FAILURE_FLAG bits of failed parts."""
     health, status = state.health, state.status
     # Offboard counts as lost when the failsafe replaces the intended mode.
-    offboard_lost = status.failsafe and status.intended_mode is Mode.OFFBOARD
+    offboard_lost = status.failsafe and status.intended_mode is flight_modes.Mode.OFFBOARD
     failed = {
         dialect.HL_FAILURE_FLAG_GPS: not health.gps,
         dialect.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE: not health.baro,
@@ -143,7 +133,7 @@ def protocol_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a build
     return sent, minimum, maximum, *no_hash, *no_hash
 
 
-AVAILABLE = tuple(sorted(BY_CUSTOM_MODE.values(), key=lambda mode: mode.spec.state))
+AVAILABLE = tuple(sorted(flight_modes.BY_CUSTOM_MODE.values(), key=lambda mode: mode.spec.state))
 """Modes as clients distinguish them, in the order of AVAILABLE_MODES."""
 
 
@@ -158,7 +148,7 @@ def available_modes() -> list[tuple[int, int, int, int, int, bytes]]:
     ]
 
 
-def _properties(spec: ModeSpec) -> int:
+def _properties(spec: flight_modes.ModeSpec) -> int:
     """Return the bits of MAV_MODE_PROPERTY."""
     advanced: int = dialect.MAV_MODE_PROPERTY_ADVANCED if spec.advanced else 0
     hidden: int = 0 if spec.requestable else dialect.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE
@@ -241,7 +231,7 @@ GROUPS: dict[int, tuple[str, ...]] = {
 """Streams of the groups of REQUEST_DATA_STREAM."""
 
 
-def _request_modes(command: VehicleCommand, context: Context) -> Result:
+def _request_modes(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameter 2: number of the mode, starting at 1; 0 = all."""
     number = command.integer(2) or 0
     modes = available_modes()
@@ -253,7 +243,7 @@ def _request_modes(command: VehicleCommand, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def handle_data_stream(message: WireMessage, context: Context) -> bool:
+def handle_data_stream(message: WireMessage, context: services.Context) -> bool:
     """Handle REQUEST_DATA_STREAM: raise the rates of a stream group, or restore the defaults.
 
     A real PX4 ignores this deprecated message. Here it can only raise rates: MAVProxy requests all
@@ -278,9 +268,11 @@ def handle_data_stream(message: WireMessage, context: Context) -> bool:
     return bool(names)
 
 
-HANDLERS: Handlers = {"REQUEST_DATA_STREAM": (for_vehicle_or_all, handle_data_stream)}
+HANDLERS: services.Handlers = {
+    "REQUEST_DATA_STREAM": (services.for_vehicle_or_all, handle_data_stream)
+}
 
-REQUESTS: dict[int, Action] = {dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes}
+REQUESTS: dict[int, services.Action] = {dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes}
 
 SILENT = (
     *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
@@ -335,23 +327,23 @@ NOT_ACKNOWLEDGED = [
 """Commands to parts that the vehicle lacks."""
 
 
-def _answer(result: Result | None) -> Action:
+def _answer(result: Result | None) -> services.Action:
     """Return an action without effect that returns this result."""
     return lambda _command, _context: result
 
 
-def _actuator_test(_command: VehicleCommand, context: Context) -> Result | None:
+def _actuator_test(_command: services.VehicleCommand, context: services.Context) -> Result | None:
     """Handle ACTUATOR_TEST: PX4 rejects it while armed; disarmed, it has no effect here."""
     armed = context.port.state().status.arming is Arming.ARMED
     return Result.DENIED if armed else None
 
 
-def _high_latency(_command: VehicleCommand, context: Context) -> Result:
+def _high_latency(_command: services.VehicleCommand, context: services.Context) -> Result:
     context.announce(OperatorText.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
     return Result.FAILED
 
 
-ACTIONS: dict[int, Action] = {
+ACTIONS: dict[int, services.Action] = {
     **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
     **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
     dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,

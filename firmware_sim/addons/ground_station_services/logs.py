@@ -13,15 +13,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import (
-    Action,
-    Context,
-    Handlers,
-    ServiceState,
-    VehicleCommand,
-    for_vehicle_or_all,
-)
 
 PACKETS_PER_TICK = 8
 """LOG_DATA messages per client and tick: 180 kB per second."""
@@ -129,7 +122,7 @@ class LogStream:
 
 
 @dataclass(slots=True)
-class LogTransfers(ServiceState):
+class LogTransfers(services.ServiceState):
     """Log transfers of one client."""
 
     listing: deque[WireMessage] = field(default_factory=deque)
@@ -143,7 +136,7 @@ class LogTransfers(ServiceState):
         return bool(self.listing) or self.download is not None or self.stream is not None
 
 
-def send_pending(context: Context) -> None:
+def send_pending(context: services.Context) -> None:
     """Send the next part of a client's log transfers; call once per tick."""
     logs = context.states.get(LogTransfers)
     if logs is None:
@@ -159,7 +152,7 @@ def send_pending(context: Context) -> None:
 # --- list and download
 
 
-def handle_list(message: WireMessage, context: Context) -> bool:
+def handle_list(message: WireMessage, context: services.Context) -> bool:
     """Start sending the entries from `start` to `end`."""
     entries = context.port.logs.entries()
     total = len(entries)
@@ -176,14 +169,14 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def handle_data(message: WireMessage, context: Context) -> bool:
+def handle_data(message: WireMessage, context: services.Context) -> bool:
     """Start sending a part of a log."""
     end = message.ofs + message.count
     context.state(LogTransfers).download = LogDownload(message.id, message.ofs, end)
     return True
 
 
-def handle_end(_message: WireMessage, context: Context) -> bool:
+def handle_end(_message: WireMessage, context: services.Context) -> bool:
     """Stop sending."""
     logs = context.state(LogTransfers)
     logs.listing.clear()
@@ -191,13 +184,13 @@ def handle_end(_message: WireMessage, context: Context) -> bool:
     return True
 
 
-def handle_erase(_message: WireMessage, context: Context) -> bool:
+def handle_erase(_message: WireMessage, context: services.Context) -> bool:
     """Reject the request: a flight's log is its record, and clients may not delete it."""
     context.announce(OperatorText(Severity.WARNING, "Logs are not erased: they belong to the run"))
     return True
 
 
-def _send_data(context: Context, download: LogDownload) -> None:
+def _send_data(context: services.Context, download: LogDownload) -> None:
     requested = min(PACKETS_PER_TICK * _PACKET_BYTES, download.end - download.offset)
     data = context.port.logs.read(download.number, download.offset, requested)
     # A packet that is not full signals the end of the log to the client.
@@ -215,7 +208,7 @@ def _send_data(context: Context, download: LogDownload) -> None:
 # --- streaming of the open log
 
 
-def _start(command: VehicleCommand, context: Context) -> Result:
+def _start(command: services.VehicleCommand, context: services.Context) -> Result:
     log = context.port.logs.open_log()
     if log is None:
         return Result.FAILED
@@ -223,12 +216,12 @@ def _start(command: VehicleCommand, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _stop(_command: VehicleCommand, context: Context) -> None:
+def _stop(_command: services.VehicleCommand, context: services.Context) -> None:
     """Stop the stream. PX4 does not acknowledge this command."""
     context.state(LogTransfers).stream = None
 
 
-def handle_ack(message: WireMessage, context: Context) -> bool:
+def handle_ack(message: WireMessage, context: services.Context) -> bool:
     """Continue after an acknowledged piece of the log header."""
     stream = context.state(LogTransfers).stream
     if stream is None or stream.waiting is None or stream.waiting.sequence != message.sequence:
@@ -237,7 +230,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _stream(context: Context, stream: LogStream) -> None:
+def _stream(context: services.Context, stream: LogStream) -> None:
     if stream.waiting is not None:
         # No retry before the timeout: the acknowledgement may be on its way.
         if context.now_us - stream.sent_us < _ACK_TIMEOUT_US:
@@ -266,20 +259,20 @@ def _stream(context: Context, stream: LogStream) -> None:
         context.link.send(dialect.MAVLink_logging_data_message(*stream.target, *piece))
 
 
-def _send_acked(context: Context, stream: LogStream, piece: Piece) -> None:
+def _send_acked(context: services.Context, stream: LogStream, piece: Piece) -> None:
     stream.sent_us, stream.tries = context.now_us, stream.tries + 1
     context.link.send(dialect.MAVLink_logging_data_acked_message(*stream.target, *piece))
 
 
-ACTIONS: dict[int, Action] = {
+ACTIONS: dict[int, services.Action] = {
     dialect.MAV_CMD_LOGGING_START: _start,
     dialect.MAV_CMD_LOGGING_STOP: _stop,
 }
 
-HANDLERS: Handlers = {
-    "LOG_REQUEST_LIST": (for_vehicle_or_all, handle_list),
-    "LOG_REQUEST_DATA": (for_vehicle_or_all, handle_data),
-    "LOG_REQUEST_END": (for_vehicle_or_all, handle_end),
-    "LOG_ERASE": (for_vehicle_or_all, handle_erase),
-    "LOGGING_ACK": (for_vehicle_or_all, handle_ack),
+HANDLERS: services.Handlers = {
+    "LOG_REQUEST_LIST": (services.for_vehicle_or_all, handle_list),
+    "LOG_REQUEST_DATA": (services.for_vehicle_or_all, handle_data),
+    "LOG_REQUEST_END": (services.for_vehicle_or_all, handle_end),
+    "LOG_ERASE": (services.for_vehicle_or_all, handle_erase),
+    "LOGGING_ACK": (services.for_vehicle_or_all, handle_ack),
 }

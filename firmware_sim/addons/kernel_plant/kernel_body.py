@@ -20,14 +20,8 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, accelerate, airframe_of, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
+from firmware_sim.addons.kernel_plant import ground_contact
 from firmware_sim.addons.kernel_plant.convex import MOST, ROW, touch_obstacle
-from firmware_sim.addons.kernel_plant.ground_contact import (
-    FLOOR_ID,
-    KEPT,
-    near_ground,
-    touch_floor,
-    touch_ground,
-)
 from firmware_sim.engine.dynamics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.body import (
     BREAKING_SHARE,
@@ -197,7 +191,7 @@ def resolve(
     )
 
 
-_FIRST = FLOOR_ID + 1
+_FIRST = ground_contact.FLOOR_ID + 1
 """Number of the first wall or obstacle."""
 
 
@@ -226,9 +220,9 @@ def _find_contacts(
     count = 0
     # Stored floor points must be updated even when the vehicle has left the floor.
     if state.many[0] > 0 or -p[2] - radius < close:
-        count = touch_floor(p, q, half, close, state.kept, state.many, state.rows, 0)
-    if near_ground(solids.relief, p, radius, close):
-        count = touch_ground(p, q, half, close, solids.relief, state.rows, count)
+        count = ground_contact.touch_floor(p, q, half, close, state.kept, state.many, state.rows, 0)
+    if ground_contact.near_ground(solids.relief, p, radius, close):
+        count = ground_contact.touch_ground(p, q, half, close, solids.relief, state.rows, count)
     # `room` is a lower bound: no solid can be close yet.
     if state.room[0] > close:
         return count
@@ -315,7 +309,9 @@ class KernelBody:
     ) -> None:
         """Place the body at rest on the floor at the start, facing north; see `plant.new_body`."""
         self._solids, names = solids_of(arena)
-        self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
+        self.names: Mapping[int, str] = dict(
+            enumerate([FLOOR, *names], start=ground_contact.FLOOR_ID)
+        )
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])
         radius = float(np.linalg.norm(self._half))
         """Half diagonal of the collision box [m]."""
@@ -324,7 +320,7 @@ class KernelBody:
         self._tick_s = tick_s
         self._obstacle_speed = greatest_speed(self._solids)
         self._state = ContactState(
-            np.zeros((KEPT, 7)),
+            np.zeros((ground_contact.KEPT, 7)),
             np.zeros(1, np.int64),
             # -inf: the first tick measures the room.
             np.full(1, -math.inf),

@@ -13,28 +13,11 @@ from enum import Enum, auto
 
 from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.addons.missions import items
 from firmware_sim.addons.missions.feasibility import FeasibilityResult
-from firmware_sim.addons.missions.items import (
-    STANDING,
-    Arrival,
-    FlownItem,
-    NavCommand,
-    PlanFrame,
-    Triplet,
-    TripletKind,
-    as_flown,
-    go_to,
-    next_places,
-)
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events.definition import Level, MavlinkEvent, define
-from firmware_sim.autopilot.navigation.plan import (
-    Crew,
-    MissionType,
-    NavigationState,
-    PlanItem,
-    Plans,
-)
+from firmware_sim.autopilot.navigation import plan
 
 _MODE_LOCATION = 3
 """MAV_ROI_LOCATION."""
@@ -51,18 +34,18 @@ class VehicleRoi:
         """Set the region of interest to a place (MAV_CMD_DO_SET_ROI_LOCATION); None = clear it."""
         self._at = place
 
-    def command(self, item: PlanItem) -> None:
+    def command(self, item: plan.PlanItem) -> None:
         """Execute a mission item about the region of interest; others are ignored."""
         place = Geodetic(item.x, item.y, item.z)
-        if item.command == NavCommand.DO_SET_ROI_NONE:
+        if item.command == items.NavCommand.DO_SET_ROI_NONE:
             self._at = None
-        elif item.command == NavCommand.DO_SET_ROI_LOCATION:
+        elif item.command == items.NavCommand.DO_SET_ROI_LOCATION:
             self._at = place
-        elif item.command == NavCommand.DO_SET_ROI_WPNEXT_OFFSET:
+        elif item.command == items.NavCommand.DO_SET_ROI_WPNEXT_OFFSET:
             offset = math.radians(item.z)
             self._at = offset if math.isfinite(offset) else 0.0
-        elif item.command == NavCommand.DO_SET_ROI:
-            located = item.frame != PlanFrame.MISSION and item.params[0] == _MODE_LOCATION
+        elif item.command == items.NavCommand.DO_SET_ROI:
+            located = item.frame != items.PlanFrame.MISSION and item.params[0] == _MODE_LOCATION
             self._at = place if located else None
 
     def heading(
@@ -85,7 +68,7 @@ class VehicleRoi:
         return wrap_pi(math.atan2(east, north) + offset)
 
 
-_N = NavCommand
+_N = items.NavCommand
 NAN = math.nan
 
 _LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
@@ -126,10 +109,10 @@ class MissionExecutor:
 
     def __init__(
         self,
-        plans: Plans,
+        plans: plan.Plans,
         value: Callable[[str], float],
-        crew: Crew,
-        check: Callable[[NavigationState], FeasibilityResult],
+        crew: plan.Crew,
+        check: Callable[[plan.NavigationState], FeasibilityResult],
         *,
         climbs_first: bool = True,
     ) -> None:
@@ -138,7 +121,7 @@ class MissionExecutor:
         `climbs_first`: climb to the first item's altitude before departure.
         """
         self._plans, self._value, self._crew, self._check = plans, value, crew, check
-        self.triplet = STANDING
+        self.triplet = items.STANDING
         """Current path."""
         self.valid = False
         """True if there is a feasible mission."""
@@ -150,8 +133,8 @@ class MissionExecutor:
         self._running = False
         self._active = False
         self._work = _Work.ITEM
-        self._flown = FlownItem(_N.WAYPOINT, (0.0, 0.0, 0.0))
-        self._arrival = Arrival(value)
+        self._flown = items.FlownItem(_N.WAYPOINT, (0.0, 0.0, 0.0))
+        self._arrival = items.Arrival(value)
         self._climbs_first = climbs_first
         self._climb_down = NAN
         """Height NED of the climb before departure; NaN = none."""
@@ -166,14 +149,14 @@ class MissionExecutor:
 
     # --- interface to the autopilot
 
-    def idle(self, situation: NavigationState, *, armed: bool) -> None:
+    def idle(self, situation: plan.NavigationState, *, armed: bool) -> None:
         """Track changes of the plans while another mode flies."""
         if not armed:
             self._disarmed_meanwhile = True
         self._is_changed()
         self.review(situation)
 
-    def activate(self, situation: NavigationState) -> None:
+    def activate(self, situation: plan.NavigationState) -> None:
         """Start Mission mode."""
         plans = self._plans
         self._is_changed()
@@ -185,7 +168,7 @@ class MissionExecutor:
             plans.jumps_done.clear()
         self._began_before, self._disarmed_meanwhile = True, False
         self.cruise_m_s = NAN
-        self._active, self.triplet = True, STANDING
+        self._active, self.triplet = True, items.STANDING
         self._begin(situation.landed)
         self._speed_to_restore = self._speed_before(plans.current)
         self._climb_first(situation)
@@ -198,11 +181,11 @@ class MissionExecutor:
         self._work = _Work.ITEM
         self._plans.reached = -1
 
-    def update(self, situation: NavigationState) -> None:
+    def update(self, situation: plan.NavigationState) -> None:
         """Advance the mission; call at 20 Hz in Mission mode."""
         if self._is_changed():
             self.review(situation)
-            self.triplet = STANDING
+            self.triplet = items.STANDING
             self._begin(situation.landed)
             self._take_item(situation)
         self._follow_home(situation)
@@ -221,7 +204,7 @@ class MissionExecutor:
     def _is_changed(self) -> bool:
         """Return whether a client has changed the mission or its current item."""
         plans = self._plans
-        mission = plans.stored(MissionType.MISSION)
+        mission = plans.stored(plan.MissionType.MISSION)
         versions = (mission.revision, plans.set_current_count)
         if versions == self._versions:
             return False
@@ -230,17 +213,17 @@ class MissionExecutor:
         self._versions = versions
         return True
 
-    def review(self, situation: NavigationState) -> None:
+    def review(self, situation: plan.NavigationState) -> None:
         """Check the mission after a change of mission, fence or home."""
         if self._inputs(situation) != self._checked_for:
             self._validate(situation)
 
-    def _inputs(self, situation: NavigationState) -> tuple[object, ...]:
+    def _inputs(self, situation: plan.NavigationState) -> tuple[object, ...]:
         """Return the inputs of the feasibility check, for comparison."""
-        kinds = (MissionType.MISSION, MissionType.FENCE)
+        kinds = (plan.MissionType.MISSION, plan.MissionType.FENCE)
         return *(self._plans.stored(kind).revision for kind in kinds), situation.home
 
-    def _validate(self, situation: NavigationState) -> None:
+    def _validate(self, situation: plan.NavigationState) -> None:
         self._checked_for = self._inputs(situation)
         verdict = self._check(situation)
         for message in verdict.messages:
@@ -262,10 +245,10 @@ class MissionExecutor:
         self._work = _Work.ITEM
         self._plans.reached = -1
 
-    def _climb_first(self, situation: NavigationState) -> None:
+    def _climb_first(self, situation: plan.NavigationState) -> None:
         """Determine whether the vehicle must climb before departure."""
         self._climb_down = NAN
-        following = next_places(self._plans, self._plans.current, 1)
+        following = items.next_places(self._plans, self._plans.current, 1)
         if self._running and following and self._climbs_first:
             down = self._place(following[0], situation)[2]
             if situation.position[2] - down > self._value("NAV_MC_ALT_RAD"):
@@ -280,10 +263,10 @@ class MissionExecutor:
         ]
         return speeds[-1] if speeds and speeds[-1] > 0.0 else NAN
 
-    def _advance(self, situation: NavigationState) -> None:
+    def _advance(self, situation: plan.NavigationState) -> None:
         """Advance to the next item, or end the mission."""
         if self._work is _Work.ITEM:
-            following = go_to(self._plans, self._plans.current + 1)
+            following = items.go_to(self._plans, self._plans.current + 1)
             if following is None:
                 landed = situation.landed
                 end = MISSION_FINISHED if landed else MISSION_FINISHED_LOITER
@@ -295,30 +278,30 @@ class MissionExecutor:
             self._plans.current = following
         self._take_item(situation)
 
-    def _end(self, situation: NavigationState) -> None:
+    def _end(self, situation: plan.NavigationState) -> None:
         """Hold position at the end of the mission."""
         self._running = False
         self.finished = True
         triplet = self.triplet
         if situation.landed:
-            self.triplet = Triplet(TripletKind.IDLE, situation.position)
+            self.triplet = items.Triplet(items.TripletKind.IDLE, situation.position)
             return
-        target = triplet.target if triplet.kind is TripletKind.LOITER else situation.position
-        self.triplet = Triplet(
-            TripletKind.LOITER, target, yaw=triplet.yaw, acceptance_m=triplet.acceptance_m
+        target = triplet.target if triplet.kind is items.TripletKind.LOITER else situation.position
+        self.triplet = items.Triplet(
+            items.TripletKind.LOITER, target, yaw=triplet.yaw, acceptance_m=triplet.acceptance_m
         )
 
     # --- one item
 
-    def _take_item(self, situation: NavigationState) -> None:
+    def _take_item(self, situation: plan.NavigationState) -> None:
         """Set the path for the current item."""
         if not self._running:
             self._end(situation)
             return
         plans = self._plans
         item = plans.mission[plans.current]
-        flown = self._flown = as_flown(item, self._place(item, situation))
-        following = next_places(plans, plans.current + 1, 2)
+        flown = self._flown = items.as_flown(item, self._place(item, situation))
+        following = items.next_places(plans, plans.current + 1, 2)
         places = [self._place(place, situation) for place in following]
         work, old = _Work.ITEM, self.triplet
         if item.has_position:
@@ -327,14 +310,14 @@ class MissionExecutor:
                 places = [first]
             self._set_triplet(flown, situation, places)
         elif item.command == _N.CONDITION_GATE and places:
-            target = Triplet(
-                TripletKind.POSITION, places[0], next=places[1] if len(places) > 1 else None
+            target = items.Triplet(
+                items.TripletKind.POSITION, places[0], next=places[1] if len(places) > 1 else None
             )
             self.triplet = target._replace(
                 acceptance_m=self._arrival.acceptance_m(flown), cruise_m_s=self.cruise_m_s
             )
         if self._work is not _Work.MOVE_TO_LAND and not self.triplet.same_target(old):
-            came_from = old.target if old.kind is not TripletKind.IDLE else None
+            came_from = old.target if old.kind is not items.TripletKind.IDLE else None
             self.triplet = self.triplet._replace(previous=came_from)
         elif self._work is not _Work.MOVE_TO_LAND:
             self.triplet = self.triplet._replace(previous=old.previous)
@@ -343,7 +326,9 @@ class MissionExecutor:
         self._arrival.restart()
         self._home_altitude_m = situation.home.altitude_m
 
-    def _prepare(self, item: PlanItem, situation: NavigationState) -> tuple[_Work, Vec | None]:
+    def _prepare(
+        self, item: plan.PlanItem, situation: plan.NavigationState
+    ) -> tuple[_Work, Vec | None]:
         """Replace the item by a preparatory step if needed; return the item's place after it."""
         flown = self._flown
         north, east, down = situation.position
@@ -365,43 +350,47 @@ class MissionExecutor:
         far = away > self._value("NAV_ACC_RAD")
         if item.command == _N.LAND and not situation.landed and far and self._work is _Work.ITEM:
             then = flown.place
-            level = self.triplet.target[2] if self.triplet.kind is TripletKind.POSITION else down
+            level = (
+                self.triplet.target[2] if self.triplet.kind is items.TripletKind.POSITION else down
+            )
             flown.command, flown.place = _N.WAYPOINT, (then[0], then[1], level)
             flown.stay_s, flown.acceptance_m, flown.autocontinue = 0.0, 0.0, True
             self.triplet = self.triplet._replace(previous=None)
             return _Work.MOVE_TO_LAND, then
         return _Work.ITEM, None
 
-    def _set_triplet(self, flown: FlownItem, situation: NavigationState, places: list[Vec]) -> None:
+    def _set_triplet(
+        self, flown: items.FlownItem, situation: plan.NavigationState, places: list[Vec]
+    ) -> None:
         if flown.command in _LOITERS:
-            kind = TripletKind.LOITER
+            kind = items.TripletKind.LOITER
         elif flown.command == _N.LAND:
-            kind = TripletKind.LAND
+            kind = items.TripletKind.LAND
         elif flown.command == _N.TAKEOFF and situation.landed:
-            kind = TripletKind.TAKEOFF
+            kind = items.TripletKind.TAKEOFF
         else:
-            kind = TripletKind.POSITION
+            kind = items.TripletKind.POSITION
         # With a stay at the waypoint, the vehicle brakes before it.
         goes_on = flown.autocontinue and flown.stay_s <= 0.0 and bool(places)
-        self.triplet = Triplet(
+        self.triplet = items.Triplet(
             kind,
             flown.place,
             previous=self.triplet.previous,
             next=places[0] if goes_on else None,
             yaw=flown.yaw,
             acceptance_m=self._arrival.acceptance_m(flown),
-            precision=flown.precision if kind is TripletKind.LAND else 0,
+            precision=flown.precision if kind is items.TripletKind.LAND else 0,
             cruise_m_s=self.cruise_m_s,
         )
 
-    def _place(self, item: PlanItem, situation: NavigationState) -> Vec:
+    def _place(self, item: plan.PlanItem, situation: plan.NavigationState) -> Vec:
         if not (item.has_position or item.command == _N.CONDITION_GATE):
             return situation.position
         north, east, down = situation.local(item.place(situation.home.altitude_m))
         # An omitted altitude is the current one.
         return north, east, down if math.isfinite(down) else situation.position[2]
 
-    def _follow_home(self, situation: NavigationState) -> None:
+    def _follow_home(self, situation: plan.NavigationState) -> None:
         """Shift relative altitudes when home has moved."""
         rise = situation.home.altitude_m - self._home_altitude_m
         self._home_altitude_m = situation.home.altitude_m
@@ -419,7 +408,7 @@ class MissionExecutor:
 
     # --- commands
 
-    def _issue(self, item: PlanItem, situation: NavigationState) -> None:
+    def _issue(self, item: plan.PlanItem, situation: plan.NavigationState) -> None:
         """Execute an item without a place."""
         command, params = item.command, item.params
         self._arrival.issued(situation.time_us)
@@ -435,9 +424,9 @@ class MissionExecutor:
         else:
             self.roi.command(item)
 
-    def _turn_to_roi(self, situation: NavigationState) -> None:
+    def _turn_to_roi(self, situation: plan.NavigationState) -> None:
         """Point the nose to the region of interest, unless the mount does (MIS_MNT_YAW_CTL)."""
-        turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
+        turns = self.triplet.kind in (items.TripletKind.POSITION, items.TripletKind.LOITER)
         if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:
             return
         yaw = self.roi.heading(

@@ -36,16 +36,8 @@ from firmware_sim.autopilot.inputs import ModeRequest, PrecisionRequest
 from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode
 from firmware_sim.autopilot.modes.return_to_launch import return_height
+from firmware_sim.autopilot.navigation import plan
 from firmware_sim.autopilot.navigation.navigator import FenceMonitor
-from firmware_sim.autopilot.navigation.plan import (
-    Crew,
-    Missions,
-    MissionType,
-    NavigationState,
-    PlanItem,
-    Plans,
-    distance_m,
-)
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, triple
 
 _N = NavCommand
@@ -59,7 +51,7 @@ MOST_ITEMS = 1_000
 """Maximum length of a return path: a mission may jump back 65,535 times."""
 
 
-def landing_start(items: tuple[PlanItem, ...]) -> int | None:
+def landing_start(items: tuple[plan.PlanItem, ...]) -> int | None:
     """Return the index of the mission's landing: DO_LAND_START, else NAV_LAND.
 
     None if the mission has no landing.
@@ -72,8 +64,8 @@ def landing_start(items: tuple[PlanItem, ...]) -> int | None:
 
 
 def along_mission(
-    plans: Plans, home: Geodetic, here: Geodetic, *, flying: bool
-) -> tuple[PlanItem, ...]:
+    plans: plan.Plans, home: Geodetic, here: Geodetic, *, flying: bool
+) -> tuple[plan.PlanItem, ...]:
     """Return the path of RTL_TYPE 2: on to the mission's landing, else back to its start.
 
     Args:
@@ -91,12 +83,12 @@ def along_mission(
     return _back(items, index - 1 if flying else index, home)
 
 
-def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
+def onwards(plans: plan.Plans, index: int) -> tuple[plan.PlanItem, ...]:
     """Return the places from an item to the landing, including remaining jumps."""
-    remaining = Plans()
-    remaining.store(MissionType.MISSION, plans.mission, 0)
+    remaining = plan.Plans()
+    remaining.store(plan.MissionType.MISSION, plans.mission, 0)
     remaining.jumps_done = dict(plans.jumps_done)
-    way: list[PlanItem] = []
+    way: list[plan.PlanItem] = []
     following = go_to(remaining, index)
     for _ in range(MOST_ITEMS):
         if following is None:
@@ -110,17 +102,19 @@ def onwards(plans: Plans, index: int) -> tuple[PlanItem, ...]:
     return tuple(way)
 
 
-def at(command: int, place: Geodetic, altitude_m: float) -> PlanItem:
+def at(command: int, place: Geodetic, altitude_m: float) -> plan.PlanItem:
     """Return an item at a place and an altitude above mean sea level [m]."""
     params = (0.0, 0.0, 0.0, NAN)
-    return PlanItem(
+    return plan.PlanItem(
         command, PlanFrame.GLOBAL, params, place.latitude_deg, place.longitude_deg, altitude_m
     )
 
 
-def _back(items: tuple[PlanItem, ...], index: int, home: Geodetic) -> tuple[PlanItem, ...]:
+def _back(
+    items: tuple[plan.PlanItem, ...], index: int, home: Geodetic
+) -> tuple[plan.PlanItem, ...]:
     """Return the places from an item back to the take-off, then the landing at home."""
-    way: list[PlanItem] = []
+    way: list[plan.PlanItem] = []
     for item in reversed(items[: max(index, 0) + 1]):
         if item.has_position:
             way.append(_passed(item))
@@ -129,7 +123,7 @@ def _back(items: tuple[PlanItem, ...], index: int, home: Geodetic) -> tuple[Plan
     return (*way, at(_N.LAND, home, home.altitude_m))
 
 
-def _passed(item: PlanItem) -> PlanItem:
+def _passed(item: plan.PlanItem) -> plan.PlanItem:
     """Return an item as a waypoint without a stay; LOITER_TO_ALT is unchanged."""
     _, radius, passing, heading = item.params
     if item.command == _N.LOITER_TO_ALT:
@@ -140,13 +134,13 @@ def _passed(item: PlanItem) -> PlanItem:
     )
 
 
-def _nearest(items: tuple[PlanItem, ...], home: Geodetic, here: Geodetic) -> int | None:
+def _nearest(items: tuple[plan.PlanItem, ...], home: Geodetic, here: Geodetic) -> int | None:
     """Return the item with the nearest place in 3D; None = no places."""
 
     def away(index: int) -> float:
         place = items[index].place(home.altitude_m)
         height = place.altitude_m - here.altitude_m
-        return math.hypot(distance_m(place[:2], here[:2]), height)
+        return math.hypot(plan.distance_m(place[:2], here[:2]), height)
 
     places = [index for index, item in enumerate(items) if item.has_position]
     return min(places, key=away, default=None)
@@ -181,7 +175,7 @@ class Destination(NamedTuple):
 
 
 def destination(
-    plans: Plans, home: Geodetic, here: Geodetic, kind: int, *, valid: bool = True
+    plans: plan.Plans, home: Geodetic, here: Geodetic, kind: int, *, valid: bool = True
 ) -> Destination:
     """Return the destination of Return.
 
@@ -194,7 +188,7 @@ def destination(
     """
 
     def away(place: Geodetic) -> float:
-        return distance_m(place[:2], here[:2])
+        return plan.distance_m(place[:2], here[:2])
 
     best = Destination(home)
     nearest = math.inf if kind == ReturnType.NOT_HOME else away(home)
@@ -205,27 +199,27 @@ def destination(
         candidates += [Destination(place, by_landing=True) for place in places]
     rally = [
         item.place(home.altitude_m)
-        for item in plans.stored(MissionType.RALLY).items
+        for item in plans.stored(plan.MissionType.RALLY).items
         if item.command == NavCommand.RALLY_POINT
     ]
-    far = [place for place in rally if distance_m(place[:2], home[:2]) > OF_HOME_M]
+    far = [place for place in rally if plan.distance_m(place[:2], home[:2]) > OF_HOME_M]
     for candidate in [*candidates, *map(Destination, far)]:
         if away(candidate.place) + NEARER_M < nearest:
             best, nearest = candidate, away(candidate.place)
     return best
 
 
-class MissionManager(Missions):
+class MissionManager(plan.Missions):
     """Executors of Mission and of Return along mission items; `triplet` is the active path."""
 
     def __init__(
-        self, plans: Plans, value: Callable[[str], float], crew: Crew, fence: FenceMonitor
+        self, plans: plan.Plans, value: Callable[[str], float], crew: plan.Crew, fence: FenceMonitor
     ) -> None:
         """Store the plans, the look-up for PX4 parameters, the callbacks and the geofence."""
         self._plans, self._value, self._crew, self._fence = plans, value, crew, fence
         self.executor = MissionExecutor(plans, value, crew, self._check)
         """Mission executor, which also holds region of interest and speed."""
-        self._way_home = Plans()
+        self._way_home = plan.Plans()
         """Mission items flown by Return."""
         self._returning = MissionExecutor(
             self._way_home, value, crew, self._check_way_home, climbs_first=False
@@ -253,7 +247,7 @@ class MissionManager(Missions):
         """True if the active mission has ended."""
         return self._flying and self.executor.finished
 
-    def review(self, now: NavigationState, /) -> None:
+    def review(self, now: plan.NavigationState, /) -> None:
         """Check the mission after a change of mission, fence or home."""
         self.executor.review(now)
 
@@ -261,14 +255,14 @@ class MissionManager(Missions):
         """Set the region of interest; None = clear it."""
         self.executor.roi.look_at(place)
 
-    def destination(self, now: NavigationState, /) -> Geodetic | None:
+    def destination(self, now: plan.NavigationState, /) -> Geodetic | None:
         """Return the destination of Return by RTL_TYPE; None = along mission items."""
         if self._return_type is ReturnType.MISSION:
             return None
         goal = self._goal(now)
         return None if goal.by_landing else goal.place
 
-    def step(self, now: NavigationState, mode: Mode, /, *, armed: bool) -> None:
+    def step(self, now: plan.NavigationState, mode: Mode, /, *, armed: bool) -> None:
         """Advance by a period of the navigator."""
         flying = armed and mode is Mode.MISSION
         self._step_home(now, returning=armed and mode is Mode.RETURN)
@@ -282,7 +276,7 @@ class MissionManager(Missions):
             self.executor.idle(now, armed=armed)
         self._flying = flying
 
-    def _step_home(self, now: NavigationState, *, returning: bool) -> None:
+    def _step_home(self, now: plan.NavigationState, *, returning: bool) -> None:
         """Advance Return along the mission, if it flies mission items."""
         if not returning:
             if self._home_by_mission:
@@ -303,11 +297,11 @@ class MissionManager(Missions):
         number = round(self._value("RTL_TYPE"))
         return ReturnType(number) if number in set(ReturnType) else ReturnType.HOME_OR_RALLY
 
-    def _goal(self, now: NavigationState) -> Destination:
+    def _goal(self, now: plan.NavigationState) -> Destination:
         here = local_to_geodetic(np.array(now.position), now.origin)
         return destination(self._plans, now.home, here, self._return_type, valid=self.valid)
 
-    def _plan_way_home(self, now: NavigationState, *, flying: bool) -> None:
+    def _plan_way_home(self, now: plan.NavigationState, *, flying: bool) -> None:
         """Store the items for Return; `flying`: a mission was active until now."""
         here = local_to_geodetic(np.array(now.position), now.origin)
         if self._return_type is not ReturnType.MISSION:
@@ -316,15 +310,17 @@ class MissionManager(Missions):
             way = along_mission(self._plans, now.home, here, flying=flying)
         else:
             way = ()
-        self._way_home.store(MissionType.MISSION, way, 0, 0)
+        self._way_home.store(plan.MissionType.MISSION, way, 0, 0)
 
-    def _way_to_landing(self, now: NavigationState, here: Geodetic) -> tuple[PlanItem, ...]:
+    def _way_to_landing(
+        self, now: plan.NavigationState, here: Geodetic
+    ) -> tuple[plan.PlanItem, ...]:
         """Return the climb and the complete landing of the mission."""
         begin = landing_start(self._plans.mission)
         if begin is None:
             return ()
         ground = self._goal(now).place
-        away = distance_m(ground[:2], here[:2])
+        away = plan.distance_m(ground[:2], here[:2])
         above = return_height(self._value, here.altitude_m - ground.altitude_m, away)
         landing = onwards(self._plans, begin)
         altitude = ground.altitude_m + above
@@ -335,10 +331,10 @@ class MissionManager(Missions):
         self._crew.say(OperatorText(Severity.INFO, text, event))
         return (at(_N.WAYPOINT, here, altitude), *landing)
 
-    def _check_way_home(self, _now: NavigationState) -> FeasibilityResult:
+    def _check_way_home(self, _now: plan.NavigationState) -> FeasibilityResult:
         return FeasibilityResult(bool(self._way_home.mission), ())
 
-    def _check(self, now: NavigationState) -> FeasibilityResult:
+    def _check(self, now: plan.NavigationState) -> FeasibilityResult:
         return check(
             self._plans.mission,
             now.home,

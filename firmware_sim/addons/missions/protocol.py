@@ -17,15 +17,8 @@ from firmware_sim.addons.missions.items import MOST_ITEMS
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem, Stored
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
-from firmware_sim.mavlink.services import (
-    ANY,
-    Action,
-    Context,
-    ServiceState,
-    VehicleCommand,
-    sender,
-)
 
 RETRY_US = 250_000
 """Time without an item after which the request is repeated [µs] (PX4)."""
@@ -90,7 +83,7 @@ REPEAT_US = 1_000_000
 
 
 @dataclass(slots=True)
-class MissionTransfer(ServiceState):
+class MissionTransfer(services.ServiceState):
     """State of one link's mission transfers."""
 
     activity: Activity = Activity.IDLE
@@ -127,14 +120,14 @@ class MissionTransfer(ServiceState):
 
 
 _IDLE, _SENDING, _RECEIVING = Activity.IDLE, Activity.SENDING, Activity.RECEIVING
-_PLANNERS = (COMPONENT_ID, ANY, dialect.MAV_COMP_ID_MISSIONPLANNER)
+_PLANNERS = (COMPONENT_ID, services.ANY, dialect.MAV_COMP_ID_MISSIONPLANNER)
 
 ALL: int = dialect.MAV_MISSION_TYPE_ALL
 _ACCEPTED: int = dialect.MAV_MISSION_ACCEPTED
 _ERROR: int = dialect.MAV_MISSION_ERROR
 
 
-def is_addressed(message: WireMessage, context: Context) -> bool:
+def is_addressed(message: WireMessage, context: services.Context) -> bool:
     """Return True if a message is addressed to this vehicle's mission manager."""
     return bool(
         message.target_system == context.system_id and message.target_component in _PLANNERS
@@ -144,10 +137,10 @@ def is_addressed(message: WireMessage, context: Context) -> bool:
 # --- downloads
 
 
-def handle_list(message: WireMessage, context: Context) -> bool:
+def handle_list(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_REQUEST_LIST: start a download by sending the number of items."""
     transfer = context.state(MissionTransfer)
-    partner = sender(message)
+    partner = services.sender(message)
     _end_complete_download(transfer)
     # A repeated request from the same client restarts the download: the count was lost.
     again = (
@@ -170,11 +163,11 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def handle_request(message: WireMessage, context: Context) -> bool:
+def handle_request(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_REQUEST(_INT): send an item of the running download."""
     transfer = context.state(MissionTransfer)
     transfer.integer = message.get_type() == "MISSION_REQUEST_INT"
-    if sender(message) != transfer.partner:
+    if services.sender(message) != transfer.partner:
         _report(context, "WPM: REJ. CMD: partner id mismatch", REQUEST_OF_ANOTHER)
         return True
     if transfer.activity is _RECEIVING:
@@ -196,10 +189,10 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def handle_ack(message: WireMessage, context: Context) -> bool:
+def handle_ack(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_ACK: end a download, or react to the client's reply to a request."""
     transfer = context.state(MissionTransfer)
-    if sender(message) != transfer.partner:
+    if services.sender(message) != transfer.partner:
         _report(context, "REJ. WP CMD: partner id mismatch", ACK_OF_ANOTHER)
         return True
     if transfer.activity is _SENDING and transfer.kind == message.mission_type:
@@ -219,9 +212,9 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
 # --- uploads
 
 
-def handle_count(message: WireMessage, context: Context) -> bool:
+def handle_count(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_COUNT: start an upload. A count of 0 clears the list."""
-    transfer, partner = context.state(MissionTransfer), sender(message)
+    transfer, partner = context.state(MissionTransfer), services.sender(message)
     _end_complete_download(transfer)
     if transfer.activity is _SENDING:
         _report(context, "WPM: IGN MISSION_COUNT: Busy", COUNT_WHILE_SENDING)
@@ -242,8 +235,12 @@ def handle_count(message: WireMessage, context: Context) -> bool:
     return _begin_upload(message, context)
 
 
-def _begin_upload(message: WireMessage, context: Context) -> bool:
-    transfer, partner, plans = context.state(MissionTransfer), sender(message), context.port.plans
+def _begin_upload(message: WireMessage, context: services.Context) -> bool:
+    transfer, partner, plans = (
+        context.state(MissionTransfer),
+        services.sender(message),
+        context.port.plans,
+    )
     # `plans.receiving` is common to all links: one upload at a time.
     if plans.receiving:
         _acknowledge(context, partner, _ERROR)
@@ -269,9 +266,9 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def handle_item(message: WireMessage, context: Context) -> bool:
+def handle_item(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_ITEM(_INT): store an item and request the next."""
-    transfer, partner = context.state(MissionTransfer), sender(message)
+    transfer, partner = context.state(MissionTransfer), services.sender(message)
     transfer.integer = wire_items.is_int(message)
     if partner != transfer.partner:
         _report(context, "REJ. MIS ITEM: partner id mismatch", ITEM_OF_ANOTHER)
@@ -299,7 +296,7 @@ def handle_item(message: WireMessage, context: Context) -> bool:
     return _take_item(message, context)
 
 
-def _take_item(message: WireMessage, context: Context) -> bool:
+def _take_item(message: WireMessage, context: services.Context) -> bool:
     transfer = context.state(MissionTransfer)
     item, kind = wire_items.parse(message), MissionType(transfer.kind)
     if isinstance(item, int):
@@ -334,7 +331,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
 # --- the rest
 
 
-def handle_clear(message: WireMessage, context: Context) -> bool:
+def handle_clear(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_CLEAR_ALL: clear one list, or all lists."""
     transfer, kind = context.state(MissionTransfer), message.mission_type
     _end_complete_download(transfer)
@@ -346,11 +343,11 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
     for cleared in MissionType:
         if kind in (cleared, ALL):
             context.port.plans.clear(cleared)
-    _acknowledge(context, sender(message), _ACCEPTED)
+    _acknowledge(context, services.sender(message), _ACCEPTED)
     return True
 
 
-def handle_set_current(message: WireMessage, context: Context) -> bool:
+def handle_set_current(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_SET_CURRENT: select the item to resume with. The mode does not change."""
     plans = context.port.plans
     _end_complete_download(context.state(MissionTransfer))
@@ -365,7 +362,7 @@ def handle_set_current(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def send_pending(context: Context) -> None:
+def send_pending(context: services.Context) -> None:
     """Repeat requests, check timeouts, and report mission progress. Call once per tick."""
     transfer, plans = context.state(MissionTransfer), context.port.plans
     if transfer.activity is not _IDLE:
@@ -388,7 +385,7 @@ def send_pending(context: Context) -> None:
             _send_item(context, jumped[0])
 
 
-def _check_timeouts(context: Context) -> None:
+def _check_timeouts(context: services.Context) -> None:
     transfer, now_us = context.state(MissionTransfer), context.now_us
     # PX4's timeout applies to uploads and downloads.
     if now_us - transfer.received_us > TIMEOUT_US:
@@ -398,7 +395,7 @@ def _check_timeouts(context: Context) -> None:
         _request(context)
 
 
-def _send_reached(context: Context) -> None:
+def _send_reached(context: services.Context) -> None:
     transfer = context.state(MissionTransfer)
     if context.now_us - transfer.repeated_us >= REPEAT_US:
         transfer.repeated_us = context.now_us
@@ -415,11 +412,11 @@ def _end_complete_download(transfer: MissionTransfer) -> None:
         transfer.activity = _IDLE
 
 
-def _stored(context: Context, kind: int) -> Stored:
+def _stored(context: services.Context, kind: int) -> Stored:
     return context.port.plans.stored(MissionType(kind)) if kind in MOST_ITEMS else Stored()
 
 
-def _request(context: Context) -> None:
+def _request(context: services.Context) -> None:
     transfer = context.state(MissionTransfer)
     transfer.sent_us = context.now_us
     build = (
@@ -430,7 +427,7 @@ def _request(context: Context) -> None:
     context.link.send(build(*transfer.partner, transfer.index, transfer.kind))
 
 
-def _send_item(context: Context, index: int) -> None:
+def _send_item(context: services.Context, index: int) -> None:
     transfer, kind = (
         context.state(MissionTransfer),
         MissionType(context.state(MissionTransfer).kind),
@@ -449,7 +446,9 @@ def _send_item(context: Context, index: int) -> None:
     )
 
 
-def _acknowledge(context: Context, target: tuple[int, int], result: int, identity: int = 0) -> None:
+def _acknowledge(
+    context: services.Context, target: tuple[int, int], result: int, identity: int = 0
+) -> None:
     context.link.send(
         dialect.MAVLink_mission_ack_message(
             *target, result, context.state(MissionTransfer).kind, identity
@@ -457,18 +456,18 @@ def _acknowledge(context: Context, target: tuple[int, int], result: int, identit
     )
 
 
-def _report(context: Context, text: str, event: Definition) -> None:
+def _report(context: services.Context, text: str, event: Definition) -> None:
     context.announce(OperatorText.of(Severity.CRITICAL, event, text=text))
 
 
-def _break_off(context: Context, why: Definition) -> bool:
+def _break_off(context: services.Context, why: Definition) -> bool:
     context.state(MissionTransfer).activity = _IDLE
     _acknowledge(context, context.state(MissionTransfer).partner, _ERROR)
     _report(context, "WPM: REJ. CMD: Req. WP was unexpected", why)
     return True
 
 
-def _end_upload(context: Context) -> None:
+def _end_upload(context: services.Context) -> None:
     transfer = context.state(MissionTransfer)
     # Only the link that receives may release the lock of all links.
     if transfer.activity is _RECEIVING:
@@ -483,7 +482,7 @@ _ROI_LOCATION = 3
 """Value of MAV_ROI_LOCATION."""
 
 
-def _start(command: VehicleCommand, context: Context) -> Result:
+def _start(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameter 1: first item; -1 = continue the mission."""
     index = command.params[0]
     if not math.isfinite(index):
@@ -491,7 +490,7 @@ def _start(command: VehicleCommand, context: Context) -> Result:
     return context.port.start_mission(int(index))
 
 
-def _start_landing(_command: VehicleCommand, context: Context) -> Result:
+def _start_landing(_command: services.VehicleCommand, context: services.Context) -> Result:
     """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
     # DO_LAND_START has precedence; without one the first LAND item marks the landing.
@@ -501,7 +500,7 @@ def _start_landing(_command: VehicleCommand, context: Context) -> Result:
     return Result.CANCELLED
 
 
-def _look(command: VehicleCommand, context: Context) -> Result:
+def _look(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
     place = Geodetic(*command.params[4:7])
     # DO_SET_ROI carries the region type in parameter 1.
@@ -529,7 +528,7 @@ HANDLERS = {
 }
 """Handlers by message name."""
 
-ACTIONS: dict[int, Action] = {
+ACTIONS: dict[int, services.Action] = {
     dialect.MAV_CMD_MISSION_START: _start,
     dialect.MAV_CMD_DO_LAND_START: _start_landing,
     dialect.MAV_CMD_DO_SET_ROI_LOCATION: _look,

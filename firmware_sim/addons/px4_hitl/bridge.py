@@ -16,25 +16,14 @@ from functools import partial
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.errors import UsageError
+from firmware_sim import interfaces
 from firmware_sim.addons.px4_hitl.board_link import BoardLink
 from firmware_sim.addons.px4_hitl.line import Router
 from firmware_sim.external import hil_messages as hil
+from firmware_sim.external import parameters
 from firmware_sim.external.flight_stack import FirmwareRequest
 from firmware_sim.external.launcher import Launcher, no_process
-from firmware_sim.external.parameters import (
-    HITL_OUTPUT,
-    px4_airframe,
-    qgroundcontrol_file,
-    refuse_untold,
-)
 from firmware_sim.external.programs import FirmwareKind
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    FirmwareLostError,
-    FirmwareMissingError,
-    SensorSample,
-    TrueState,
-)
 from firmware_sim.mavlink.endpoint import Endpoint
 
 SILENCE_US = US_PER_S
@@ -114,7 +103,7 @@ class HitlBridge:
             link.go_down(alive)
             link.connect(timeout_s, alive, returning=True)
 
-    def step(self, sample: SensorSample) -> ActuatorControls:
+    def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Send a tick's sensors and return the newest motor commands, initially stopped."""
         self._pace.wait(sample.time_us)
         link = self._link
@@ -132,16 +121,16 @@ class HitlBridge:
         link.beat()
         message = link.board.controls
         if message is None:
-            return ActuatorControls(sample.time_us, hil.STILL, armed=False)
+            return interfaces.ActuatorControls(sample.time_us, hil.STILL, armed=False)
         self.time_us = int(message.time_usec)
         try:
             controls = hil.controls(message, sample.time_us)
         except hil.ControlsError as error:
-            raise FirmwareLostError(f"{link.device}: {error}") from error
+            raise interfaces.FirmwareLostError(f"{link.device}: {error}") from error
         self.armed = controls.armed
         return controls
 
-    def use_truth(self, truth: Callable[[], TrueState]) -> None:
+    def use_truth(self, truth: Callable[[], interfaces.TrueState]) -> None:
         """Ignore the true state: a board would use it as its estimate."""
 
     def close(self) -> None:
@@ -149,7 +138,7 @@ class HitlBridge:
         link = self._link
         if link.board.rebooting:
             # The next connection must not mistake this board for a rebooted board.
-            with suppress(FirmwareLostError):
+            with suppress(interfaces.FirmwareLostError):
                 link.go_down(no_process)
                 link.went_down = True
         elif self.armed or link.board.armed:
@@ -159,16 +148,18 @@ class HitlBridge:
     def _check(self, now_us: int) -> None:
         board, device = self._link.board, self._link.device
         if self._link.lost is not None:
-            raise FirmwareLostError(self._link.lost)
+            raise interfaces.FirmwareLostError(self._link.lost)
         if board.rebooting:
-            raise FirmwareLostError(f"{device}: the board was told to reboot, and does")
+            raise interfaces.FirmwareLostError(f"{device}: the board was told to reboot, and does")
         if board.restarted:
-            raise FirmwareLostError(f"{device}: the board has restarted: its clock went back")
+            raise interfaces.FirmwareLostError(
+                f"{device}: the board has restarted: its clock went back"
+            )
         if not board.hil:
-            raise FirmwareLostError(f"{device}: the board has left HIL mode")
+            raise interfaces.FirmwareLostError(f"{device}: the board has left HIL mode")
         quiet_us = now_us - max(board.controls_us, self._resumed_us)
         if board.controls is not None and quiet_us > SILENCE_US:
-            raise FirmwareLostError(
+            raise interfaces.FirmwareLostError(
                 f"{device}: board silent: no HIL_ACTUATOR_CONTROLS for "
                 f"{(now_us - board.controls_us) / US_PER_S:.1f} s"
             )
@@ -179,13 +170,15 @@ class HitlBridge:
                 "link allow more than 5000 bytes/s (MAV_0_RATE; USB always does)?"
             )
         if problem is not None and self.time_us == 0:
-            raise FirmwareMissingError(f"--serial {device}: the board: {problem}")
+            raise interfaces.FirmwareMissingError(f"--serial {device}: the board: {problem}")
         if problem is not None:
-            raise FirmwareLostError(f"{device}: the board: {problem}")
+            raise interfaces.FirmwareLostError(f"{device}: the board: {problem}")
         if self._stuck_us is not None and now_us - self._stuck_us > SILENCE_US:
-            raise FirmwareLostError(f"{device}: the line accepts no more data: the board hangs")
+            raise interfaces.FirmwareLostError(
+                f"{device}: the line accepts no more data: the board hangs"
+            )
 
-    def _send(self, sample: SensorSample, time_us: int, now_us: int) -> None:
+    def _send(self, sample: interfaces.SensorSample, time_us: int, now_us: int) -> None:
         if self._link.send(hil.SENSOR, hil.sensor(sample, time_us)):
             self._stuck_us = None
         else:
@@ -197,8 +190,8 @@ class HitlBridge:
 def px4_hitl_parts(request: FirmwareRequest) -> tuple[Launcher, Endpoint]:
     """Bind the clients' ports. Return the launcher for the board, and the observer's endpoint."""
     options = request.aircraft.real
-    airframe = px4_airframe(request.vehicle, HITL_OUTPUT)
-    refuse_untold(request.vehicle, "px4-hitl")
+    airframe = parameters.px4_airframe(request.vehicle, parameters.HITL_OUTPUT)
+    parameters.refuse_untold(request.vehicle, "px4-hitl")
     router = Router(request.bind_ends().by_name(), WallClock())
     try:
         link = BoardLink(router, options.serial or "", options.baud)
@@ -209,7 +202,7 @@ def px4_hitl_parts(request: FirmwareRequest) -> tuple[Launcher, Endpoint]:
 
 
 PX4_HITL = FirmwareKind(
-    airframe=partial(px4_airframe, output=HITL_OUTPUT),
-    parameter_file=qgroundcontrol_file,
+    airframe=partial(parameters.px4_airframe, output=parameters.HITL_OUTPUT),
+    parameter_file=parameters.qgroundcontrol_file,
     parts=f"{__name__}:px4_hitl_parts",
 )

@@ -13,6 +13,7 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
+from firmware_sim.autopilot.failsafes import failsafe_table
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Clear,
@@ -21,14 +22,6 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Options,
     Takeover,
     can_run,
-)
-from firmware_sim.autopilot.failsafes.failsafe_table import (
-    Situation,
-    Trigger,
-    answers,
-    mode_fallback,
-    mode_of,
-    possible,
 )
 from firmware_sim.autopilot.flight_modes import Mode
 
@@ -105,7 +98,7 @@ NO_INTERVENTION = Intervention()
 class Held(NamedTuple):
     """Active action."""
 
-    trigger: Trigger
+    trigger: failsafe_table.Trigger
     options: Options
     failing: bool
     """True while the condition persists."""
@@ -163,7 +156,9 @@ class _Choice(NamedTuple):
 
 
 def update(
-    state: FailsafeState, now: Situation, intervention: Intervention = NO_INTERVENTION
+    state: FailsafeState,
+    now: failsafe_table.Situation,
+    intervention: Intervention = NO_INTERVENTION,
 ) -> FailsafeResult:
     """Return the active mode and action.
 
@@ -196,7 +191,7 @@ def update(
             choice.action, choice.delayed, choice.cause, now.intended, state.delay_us
         )
     intended = choice.intended
-    if state.active and mode_of(choice.action, intended) is Mode.ORBIT:
+    if state.active and failsafe_table.mode_of(choice.action, intended) is Mode.ORBIT:
         intended = Mode.HOLD  # Orbit does not resume after an interruption.
     state = state._replace(
         action=choice.action,
@@ -206,11 +201,11 @@ def update(
         intended=intended,
         start_delay_us=_start_delay(state, now.settings, elapsed_us, choice.delayed),
     )
-    mode = mode_of(choice.action, intended)
+    mode = failsafe_table.mode_of(choice.action, intended)
     return FailsafeResult(state, mode, intended, text, choice.delayed, choice.cause)
 
 
-def _begin(state: FailsafeState, now: Situation, elapsed_us: int) -> FailsafeState:
+def _begin(state: FailsafeState, now: failsafe_table.Situation, elapsed_us: int) -> FailsafeState:
     """Advance the delays, and store the failures present at arming."""
     state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
     lost = now.conditions.manual_control_signal_lost
@@ -232,7 +227,7 @@ def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
     return tuple(h for h in held if h.failing or h.options.clear is not Clear.ON_MODE_CHANGE)
 
 
-def _hold(state: FailsafeState, now: Situation) -> tuple[FailsafeState, bool]:
+def _hold(state: FailsafeState, now: failsafe_table.Situation) -> tuple[FailsafeState, bool]:
     """Add new failures, drop cleared ones; return also whether a warning is new."""
     now = now._replace(
         armed_us=state.armed_us,
@@ -240,7 +235,7 @@ def _hold(state: FailsafeState, now: Situation) -> tuple[FailsafeState, bool]:
         battery_at_arming=state.battery_at_arming,
     )
     # One action per trigger; rows of one trigger exclude each other.
-    failing = dict(answers(now))
+    failing = dict(failsafe_table.answers(now))
     held: list[Held] = []
     for item in state.held:
         answer = failing.pop(item.trigger, None)
@@ -284,7 +279,9 @@ def _start_delay(
     return None if remaining >= settings.com_fail_act_t * US_PER_S else remaining
 
 
-def _select(state: FailsafeState, now: Situation, intervention: Intervention) -> _Choice:
+def _select(
+    state: FailsafeState, now: failsafe_table.Situation, intervention: Intervention
+) -> _Choice:
     # Termination is final.
     if state.action is FailsafeAction.TERMINATE:
         return _Choice(FailsafeAction.TERMINATE, now.intended)
@@ -323,8 +320,8 @@ def _select(state: FailsafeState, now: Situation, intervention: Intervention) ->
             intended = Mode.POSITION
         action, taken_over, delayed = FailsafeAction.WARN, True, FailsafeAction.NONE
         # The user's mode may be impossible: then its fallback acts.
-        action = max(action, mode_fallback(now.conditions, now.settings, intended))
-    possible_now = possible(action, now.conditions)
+        action = max(action, failsafe_table.mode_fallback(now.conditions, now.settings, intended))
+    possible_now = failsafe_table.possible(action, now.conditions)
     if possible_now is not action:
         action, cause = possible_now, _GENERIC
     if _already_on_the_way(intended, action, delayed, now.conditions):

@@ -18,20 +18,8 @@ from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import FailsafeAction, MavlinkEvent
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
-from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    BatteryWarning,
-    Conditions,
-    FailsafeSettings,
-    lacking,
-    read_settings,
-)
+from firmware_sim.autopilot.failsafes import failsafe_conditions, framework
 from firmware_sim.autopilot.failsafes.failsafe_table import Situation
-from firmware_sim.autopilot.failsafes.framework import (
-    NO_INTERVENTION,
-    FailsafeState,
-    Intervention,
-    update,
-)
 from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.prearm import ArmingSettings, PrearmCheck, Readiness
@@ -74,7 +62,7 @@ class Supervisor:
         """Sensor validity."""
         self.next_us = 0
         """Time of the next check [µs]; earlier checks are harmless."""
-        self.conditions = Conditions()
+        self.conditions = failsafe_conditions.Conditions()
         """Conditions at the last check."""
         self.changes = 0
         """Number of checks with changed conditions or readiness."""
@@ -83,7 +71,7 @@ class Supervisor:
         self._ready: Readiness | None = None
         """Last input of the pre-arm checks."""
         self._armable = False
-        self._state = FailsafeState()
+        self._state = framework.FailsafeState()
         self._decided: tuple[object, ...] = ()
         self._reported: tuple[PrearmCheck, ...] | None = None
         """Checks reported as failing; None: reporting starts when the vehicle is ready."""
@@ -104,10 +92,14 @@ class Supervisor:
     def read_parameters(self) -> None:
         """Read the parameters again."""
         self.watch.read_parameters()
-        self._settings = FailsafeSettings(
-            *read_settings(FailsafeSettings._field_defaults, self._value)
+        self._settings = failsafe_conditions.FailsafeSettings(
+            *failsafe_conditions.read_settings(
+                failsafe_conditions.FailsafeSettings._field_defaults, self._value
+            )
         )
-        self._arming = ArmingSettings(*read_settings(ArmingSettings._field_defaults, self._value))
+        self._arming = ArmingSettings(
+            *failsafe_conditions.read_settings(ArmingSettings._field_defaults, self._value)
+        )
         # Changed limits may change every result.
         self.next_us, self._calm_flight = 0, None
 
@@ -217,7 +209,7 @@ class Supervisor:
             position=not seen.local_position_invalid,
             altitude=not seen.local_altitude_invalid,
             accel_error=self._estimator.recovery.doubts_inertial(now_us),
-            battery=seen.battery_warning < BatteryWarning.CRITICAL,
+            battery=seen.battery_warning < failsafe_conditions.BatteryWarning.CRITICAL,
             armable=self._armable,
         )
 
@@ -255,12 +247,17 @@ class Supervisor:
     def available(self, mode: Mode) -> bool:
         """Return whether a mode's requirements are met for a user request, pilot input aside."""
         # The caller checks pilot input.
-        return not lacking(mode, self.conditions) & ~(Need.NOT_ARMING | Need.MANUAL_CONTROL)
+        return not failsafe_conditions.lacking(mode, self.conditions) & ~(
+            Need.NOT_ARMING | Need.MANUAL_CONTROL
+        )
 
     # --- deciding
 
     def decide(
-        self, time_us: int, flight: CommanderState, intervention: Intervention = NO_INTERVENTION
+        self,
+        time_us: int,
+        flight: CommanderState,
+        intervention: framework.Intervention = framework.NO_INTERVENTION,
     ) -> FailsafeDecision | None:
         """Return the failsafes' decision for a flight; None = no change."""
         state, finished = self._state, self.watch.reports.mission_finished
@@ -271,13 +268,13 @@ class Supervisor:
         waiting = state.delay_us > 0 or state.start_delay_us is not None
         timed = self.conditions.fd_critical_failure
         idle = not (waiting or timed or state.taken_over)
-        if idle and seen == self._decided and intervention == NO_INTERVENTION:
+        if idle and seen == self._decided and intervention == framework.NO_INTERVENTION:
             return None
         self._decided = seen
         now = Situation(
             time_us, self.conditions, self._settings, flight.intended, finished, armed=armed
         )
-        outcome = update(state, now, intervention)
+        outcome = framework.update(state, now, intervention)
         self._state = outcome.state
         action = outcome.state.action
         followed = replace(

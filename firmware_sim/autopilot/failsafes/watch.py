@@ -18,28 +18,13 @@ from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.error_state import SIGMA, Q
 from firmware_sim.autopilot.estimator import GPS_GONE_US, Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.failsafes.detectors import (
-    HYSTERESIS,
-    AttitudeFailure,
-    Endurance,
-    MotorFailure,
-    Undercurrent,
-    Validity,
-    roll_and_pitch,
-)
-from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    NO_BREACH,
-    BatteryWarning,
-    Conditions,
-    FenceBreach,
-    read_settings,
-)
+from firmware_sim.autopilot.failsafes import detectors, failsafe_conditions
 from firmware_sim.autopilot.sensor_monitor import CALM_US, SensorMonitor
 from firmware_sim.engine.record import ACCEL_ROW, CHANGED, GYRO_ROW, MAG_ROW, SEEN, WATCHES, Record
 from firmware_sim.interfaces import BatterySample, SensorSample
 
 _GROUND, _AIR = FlightPhase.GROUND, FlightPhase.AIR
-_WARNINGS = tuple(BatteryWarning)
+_WARNINGS = tuple(failsafe_conditions.BatteryWarning)
 
 _RECENT, _ACCURACY, _SPEED_ACCURACY, _ROLL, _PITCH, _BATTERY = range(6)
 """Indices into the limits of `is_calm`."""
@@ -56,7 +41,7 @@ def is_calm(controller: Record, limits: Vector) -> bool:
     c = controller[0]
     now_us, s, seen = c.time_us, c.state, c.looked_at
     fused_us = min(c.gps_horizontal_us, c.baro_fused_us)
-    roll, pitch = roll_and_pitch(s[Q], s[Q + 1], s[Q + 2], s[Q + 3])
+    roll, pitch = detectors.roll_and_pitch(s[Q], s[Q + 1], s[Q + 2], s[Q + 3])
     # Any value near a limit needs the full check.
     calm = (
         c.healthy != 0
@@ -89,7 +74,7 @@ def is_calm(controller: Record, limits: Vector) -> bool:
 class Reports:
     """Reports from other parts of the autopilot; each writes only its fields."""
 
-    fence: FenceBreach = NO_BREACH
+    fence: failsafe_conditions.FenceBreach = failsafe_conditions.NO_BREACH
     mission_missing: bool = True
     """True if no feasible mission is stored."""
     mission_finished: bool = False
@@ -132,9 +117,9 @@ class Watch:
         self._estimator = estimator
         self.sensors = SensorMonitor(estimator.record["watch"][0])
         """Sensor monitor."""
-        self.attitude = AttitudeFailure()
+        self.attitude = detectors.AttitudeFailure()
         """Attitude failure detector."""
-        self.motors = MotorFailure()
+        self.motors = detectors.MotorFailure()
         """Motor failure detector."""
         self.reports = Reports()
         """Reports from other parts of the autopilot."""
@@ -143,10 +128,14 @@ class Watch:
         self._manual_us: int | None = None
         self._gcs_us: int | None = None
         self._gcs_lost = True
-        self._battery = BatteryWarning.NONE
-        self._endurance = Endurance()
+        self._battery = failsafe_conditions.BatteryWarning.NONE
+        self._endurance = detectors.Endurance()
         self._takeoff_us: int | None = None
-        self._local, self._relaxed, self._velocity = Validity(), Validity(), Validity()
+        self._local, self._relaxed, self._velocity = (
+            detectors.Validity(),
+            detectors.Validity(),
+            detectors.Validity(),
+        )
         self._gps_fused = False
         self._vision_fused = False
         self._restarts = 0
@@ -159,7 +148,7 @@ class Watch:
     def read_parameters(self) -> None:
         """Read the parameters again."""
         self.settings = p = WatchSettings(
-            *read_settings(WatchSettings._field_defaults, self._value)
+            *failsafe_conditions.read_settings(WatchSettings._field_defaults, self._value)
         )
         self._calm = None
         # 0 disables the check: no limit.
@@ -168,8 +157,8 @@ class Watch:
             [
                 # The earliest of several timeouts.
                 min(self._value("EKF2_NOAID_TOUT"), GPS_GONE_US),
-                HYSTERESIS * (p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf),
-                HYSTERESIS * p.com_vel_fs_evh,
+                detectors.HYSTERESIS * (p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf),
+                detectors.HYSTERESIS * p.com_vel_fs_evh,
                 *tilts,
                 max(p.bat_low_thr, p.bat_crit_thr, p.bat_emergen_thr, p.com_arm_bat_min),
             ]
@@ -204,12 +193,12 @@ class Watch:
         """Check the motor outputs reported by the speed controllers against the commands."""
         p = self.settings
         if p.fd_act_en:
-            limits = Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
+            limits = detectors.Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
             self.motors.take(time_us, commands, outputs, limits)
 
     def look(
         self, sample: SensorSample, phase: FlightPhase
-    ) -> tuple[Conditions, list[OperatorText]]:
+    ) -> tuple[failsafe_conditions.Conditions, list[OperatorText]]:
         """Return the current conditions and the messages for the operator."""
         seen, now_us = self._estimator.record["looked_at"][0], sample.time_us
         # Calm checks have skipped the sensor monitor: bring it up to date first.
@@ -249,7 +238,7 @@ class Watch:
             not self._armed and self._estimator.field_disturbed,
         )
 
-    def _is_usual(self, found: Conditions, now_us: int) -> bool:
+    def _is_usual(self, found: failsafe_conditions.Conditions, now_us: int) -> bool:
         """Return whether neither time nor another check would change the result."""
         p = self.settings
         return (
@@ -268,7 +257,9 @@ class Watch:
             and self.sensors.are_calm(now_us)
         )
 
-    def _conditions(self, sample: SensorSample, phase: FlightPhase) -> Conditions:
+    def _conditions(
+        self, sample: SensorSample, phase: FlightPhase
+    ) -> failsafe_conditions.Conditions:
         now_us, p, reports = sample.time_us, self.settings, self.reports
         estimator = self._estimator
         armed = phase >= _GROUND
@@ -298,7 +289,7 @@ class Watch:
             and self._takeoff_us is not None
             and now_us - self._takeoff_us > p.com_flt_time_max * US_PER_S
         )
-        return Conditions(
+        return failsafe_conditions.Conditions(
             angular_velocity_invalid=not sensors.gyro,
             attitude_invalid=not (estimator.aligned and sensors.gyro and sensors.accel),
             local_altitude_invalid=not estimator.knows_height(now_us),
@@ -325,7 +316,9 @@ class Watch:
             fd_motor_failure=self.motors.failed,
         )
 
-    def _texts(self, conditions: Conditions, now_us: int, phase: FlightPhase) -> list[OperatorText]:
+    def _texts(
+        self, conditions: failsafe_conditions.Conditions, now_us: int, phase: FlightPhase
+    ) -> list[OperatorText]:
         texts: list[OperatorText] = []
         if self._gcs_us is not None and conditions.gcs_connection_lost is not self._gcs_lost:
             lost = self._gcs_lost = conditions.gcs_connection_lost
@@ -368,7 +361,7 @@ class Watch:
         )
         return left_s < needed_s
 
-    def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
+    def _charge(self, battery: BatterySample, *, armed: bool) -> failsafe_conditions.BatteryWarning:
         """Return the battery warning level, which cannot decrease while armed."""
         p, remaining = self.settings, battery.remaining
         # The levels are nested: each limit passed adds one.

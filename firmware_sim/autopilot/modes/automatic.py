@@ -23,15 +23,7 @@ from firmware_sim.autopilot.climb import SETTLED_M, ClimbLimits
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import ClimbOn, ModeRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.modes.interface import (
-    FREE,
-    NAN,
-    FlightContext,
-    FlightMode,
-    OffboardSetpoint,
-    here,
-    over,
-)
+from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, stopping_place, triple
 from firmware_sim.engine.record import RISING, SETTLING
 
@@ -39,10 +31,10 @@ LEAST_CLIMB_M = 0.1
 """Minimum height of a take-off above the standing vehicle; below it, the vehicle stays [m]."""
 
 
-class Takeoff(FlightMode, modes=(Mode.TAKEOFF,)):
+class Takeoff(interface.FlightMode, modes=(Mode.TAKEOFF,)):
     """Take-off mode: climbs to `FlightContext.takeoff_altitude_m`, slowly near the ground."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._gently = True
@@ -71,7 +63,7 @@ class Takeoff(FlightMode, modes=(Mode.TAKEOFF,)):
     def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start the climb at the current position."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
-        self._place = here(state)
+        self._place = interface.here(state)
         self._gently = self._context.standing
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
@@ -84,7 +76,7 @@ class Takeoff(FlightMode, modes=(Mode.TAKEOFF,)):
         if not self._context.standing:
             aim(self._context)
             climb.fly(RISING, time_us, self._context.height(state))
-        return over(self._place, -climb.speed_m_s)
+        return interface.over(self._place, -climb.speed_m_s)
 
     def _fly(self, state: Vector, time_us: int) -> AnyDemand:
         """Fly to the requested place with a simultaneous climb, as in PX4."""
@@ -101,7 +93,7 @@ class Takeoff(FlightMode, modes=(Mode.TAKEOFF,)):
         if not self.is_done(state):
             return None
         if self._context.takeoff_place is not None:
-            return Reposition(PositionYaw(self._end, NAN))
+            return Reposition(PositionYaw(self._end, interface.NAN))
         return ClimbOn(PositionYaw(self._end, self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
@@ -112,15 +104,15 @@ class Takeoff(FlightMode, modes=(Mode.TAKEOFF,)):
         return self._context.height(state) > _end_m(self._context)
 
 
-def leave_ground(context: FlightContext, state: Vector, time_us: int) -> Demand:
+def leave_ground(context: interface.FlightContext, state: Vector, time_us: int) -> Demand:
     """Return the demand on the ground; the trajectory starts at lift-off."""
     context.travel.launch(state, time_us, context.climb.speed_m_s)
-    place = here(state)
+    place = interface.here(state)
     north, east, _ = place.position
-    return Demand((north, east, NAN), FREE, place.yaw, NAN)
+    return Demand((north, east, interface.NAN), interface.FREE, place.yaw, interface.NAN)
 
 
-def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLimits:
+def gentle(limits: PathLimits, context: interface.FlightContext, state: Vector) -> PathLimits:
     """Return the limits of a take-off: near the ground, at most MPC_TKO_SPEED."""
     value = context.value
     if context.over_ground(state) >= value("MPC_LAND_ALT1"):
@@ -130,13 +122,13 @@ def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLim
     return limits._replace(up_m_s=speed, up_m_s2=acceleration)
 
 
-def _end_m(context: FlightContext) -> float:
+def _end_m(context: interface.FlightContext) -> float:
     """Return the height above home at which a take-off counts as near its altitude [m]."""
     altitude, radius = context.takeoff_altitude_m, context.value("NAV_MC_ALT_RAD")
     return altitude - (altitude / 2.0 if altitude < radius else radius)
 
 
-def aim(context: FlightContext) -> None:
+def aim(context: interface.FlightContext) -> None:
     """Set the climb to the take-off altitude with the limits of PX4's FlightTaskAuto."""
     value = context.value
     jerk, brisk_m_s2 = value("MPC_JERK_AUTO"), value("MPC_ACC_UP_MAX")
@@ -156,10 +148,10 @@ STANDING_M_S = 0.3
 """Speed below which a vehicle counts as stopped: Hold and Land then keep the position [m/s]."""
 
 
-class Hold(FlightMode, modes=(Mode.HOLD,)):
+class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
     """Hold mode: brakes, then holds the position of the stop."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._braking = False
@@ -188,7 +180,7 @@ class Hold(FlightMode, modes=(Mode.HOLD,)):
         elif isinstance(request, Reposition):
             self._go(request, state)
         else:
-            self._place = here(state)
+            self._place = interface.here(state)
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Brake first, then hold the position of the stop."""
@@ -204,9 +196,9 @@ class Hold(FlightMode, modes=(Mode.HOLD,)):
         if self._braking:
             self._place = self._place._replace(position=triple(state, P))
             if math.hypot(*triple(state, V)) > STANDING_M_S:
-                return Demand(FREE, (0.0, 0.0, 0.0), self._place.yaw, NAN)
+                return Demand(interface.FREE, (0.0, 0.0, 0.0), self._place.yaw, interface.NAN)
             self._braking = False
-        return Demand(self._place.position, FREE, self._place.yaw, NAN)
+        return Demand(self._place.position, interface.FREE, self._place.yaw, interface.NAN)
 
     def _go(self, request: Reposition, state: Vector) -> None:
         """Start the flight to a place; NaN coordinates keep their current value.
@@ -238,9 +230,9 @@ class Hold(FlightMode, modes=(Mode.HOLD,)):
             climb.stop(ended=True)
         return Demand(
             (north, east, context.home[2] - climb.height_m),
-            (NAN, NAN, -climb.speed_m_s),
+            (interface.NAN, interface.NAN, -climb.speed_m_s),
             self._place.yaw,
-            NAN,
+            interface.NAN,
         )
 
 
@@ -248,10 +240,10 @@ SLOW_BELOW_M = 0.5
 """Margin below MPC_LAND_ALT2 that exceeds the estimate's error [m]."""
 
 
-class Land(FlightMode, modes=(Mode.LAND,)):
+class Land(interface.FlightMode, modes=(Mode.LAND,)):
     """Land mode: descends at the position of the stop, with PX4's decreasing speed."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._stopping, self._began = False, (0.0, 0.0)
@@ -270,7 +262,7 @@ class Land(FlightMode, modes=(Mode.LAND,)):
 
     def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
         """Start at the current position."""
-        self._place, self._stopping = here(state), True
+        self._place, self._stopping = interface.here(state), True
         self._began = self._place.position[:2]
 
     def demand(self, state: Vector, _time_us: int, /) -> Demand:
@@ -284,12 +276,14 @@ class Land(FlightMode, modes=(Mode.LAND,)):
             north, east, _ = triple(state, V)
             if math.hypot(north, east) > STANDING_M_S:
                 self._place = self._place._replace(position=triple(state, P))
-                return Demand(FREE, (0.0, 0.0, speed), self._place.yaw, NAN)
+                return Demand(interface.FREE, (0.0, 0.0, speed), self._place.yaw, interface.NAN)
             self._stopping = False
-        return over(self._place, speed)
+        return interface.over(self._place, speed)
 
 
-def landing_speed(value: Callable[[str], float], height_m: float, ground_m: float = NAN) -> float:
+def landing_speed(
+    value: Callable[[str], float], height_m: float, ground_m: float = interface.NAN
+) -> float:
     """Return the descent speed [m/s]: PX4 slows down linearly between two heights.
 
     Args:
@@ -310,10 +304,10 @@ def landing_speed(value: Callable[[str], float], height_m: float, ground_m: floa
     return slow + (fast - slow) / (high - low) * (height_m - low)
 
 
-class Descend(FlightMode, modes=(Mode.DESCEND,)):
+class Descend(interface.FlightMode, modes=(Mode.DESCEND,)):
     """Level descent at MPC_LAND_SPEED with constant heading."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._yaw = 0.0
 
@@ -323,7 +317,12 @@ class Descend(FlightMode, modes=(Mode.DESCEND,)):
 
     def demand(self, _state: Vector, _time_us: int, /) -> Demand:
         """Return the descent demand."""
-        return Demand(FREE, (NAN, NAN, self._context.value("MPC_LAND_SPEED")), self._yaw, NAN)
+        return Demand(
+            interface.FREE,
+            (interface.NAN, interface.NAN, self._context.value("MPC_LAND_SPEED")),
+            self._yaw,
+            interface.NAN,
+        )
 
 
 CLIMBS_M_S = 0.1
@@ -332,17 +331,17 @@ CLIMBS_M_S = 0.1
 ABOVE_HOME_M = 0.3
 """Minimum height above home of a setpoint that lifts a standing vehicle [m]."""
 
-HOVER = Demand(FREE, (0.0, 0.0, 0.0), NAN, NAN)
+HOVER = Demand(interface.FREE, (0.0, 0.0, 0.0), interface.NAN, interface.NAN)
 """PX4's fallback for a setpoint with an uncommanded axis (PositionControl::inputValid)."""
 
 
-class Offboard(FlightMode, modes=(Mode.OFFBOARD,)):
+class Offboard(interface.FlightMode, modes=(Mode.OFFBOARD,)):
     """Offboard mode: flies the newest setpoint; holds position before the first."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._waiting = Hold(context)
-        self._setpoint: OffboardSetpoint | None = None
+        self._setpoint: interface.OffboardSetpoint | None = None
         self._flown: AnyDemand | None = None
         self._kind: type = Setpoint
         """Type of the active setpoint."""
@@ -389,7 +388,7 @@ class Offboard(FlightMode, modes=(Mode.OFFBOARD,)):
             return RateDemand((roll, pitch, state.item(RATES + 2)), demand.thrust)
         return demand
 
-    def _demand_of(self, setpoint: OffboardSetpoint | None) -> AnyDemand | None:
+    def _demand_of(self, setpoint: interface.OffboardSetpoint | None) -> AnyDemand | None:
         """Return a setpoint as a demand, cached while the setpoint is unchanged."""
         if setpoint is None:
             return None

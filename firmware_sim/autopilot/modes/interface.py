@@ -11,18 +11,11 @@ from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDeman
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot import inputs
 from firmware_sim.autopilot.autopilot_state import Clearance, OperatorText, OrbitStatus, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import (
-    FollowedTarget,
-    LandingTarget,
-    ModeRequest,
-    ObstacleBins,
-    PositionYaw,
-    Sticks,
-)
 from firmware_sim.autopilot.navigation.plan import Missions
 from firmware_sim.autopilot.smooth_trajectory import Travel, triple
 
@@ -60,7 +53,7 @@ class FlightContext:
     """Newest offboard setpoint."""
     setpoints: dict[type, OffboardSetpoint] = field(default_factory=dict)
     """Newest offboard setpoint by type."""
-    return_place: Callable[[], PositionYaw | None] | None = None
+    return_place: Callable[[], inputs.PositionYaw | None] | None = None
     """Returns Return's destination, or None if it flies mission items. None = home."""
     missions: Missions = field(default_factory=Missions)
     """Missions of Mission mode, and of Return if it flies mission items."""
@@ -68,13 +61,13 @@ class FlightContext:
     """True if armed: a mode selected earlier is only entered."""
     standing: bool = True
     """True if the vehicle is on the ground."""
-    sticks: Sticks | None = None
+    sticks: inputs.Sticks | None = None
     """Pilot's sticks; None = never received, or lost."""
-    target: FollowedTarget | None = None
+    target: inputs.FollowedTarget | None = None
     """Target of Follow."""
-    landing_target: LandingTarget | None = None
+    landing_target: inputs.LandingTarget | None = None
     """Target of a precision landing, as last reported."""
-    obstacles: ObstacleBins | None = None
+    obstacles: inputs.ObstacleBins | None = None
     """Obstacles, as last reported."""
     ground: Clearance | None = None
     """Height above ground; None = not measured."""
@@ -137,7 +130,7 @@ class FlightMode(Protocol):
         """Destination of an automatic mode, local NED [m]; None in all other modes."""
         return None
 
-    def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, _state: Vector, _request: inputs.ModeRequest | None, /) -> None:
         """Start at the current state.
 
         The request comes from the user, or from the previous mode (its `remainder`). Modes ignore
@@ -149,7 +142,7 @@ class FlightMode(Protocol):
         """Return the demand at a time [µs], which increases from call to call."""
         ...
 
-    def remainder(self, _state: Vector, /) -> ModeRequest | None:
+    def remainder(self, _state: Vector, /) -> inputs.ModeRequest | None:
         """Return a request for the next mode; None = the next mode starts without."""
         return None
 
@@ -179,12 +172,12 @@ def since(before_us: int | None, now_us: int) -> float:
     return 0.0 if before_us is None else (now_us - before_us) / US_PER_S
 
 
-def here(state: Vector) -> PositionYaw:
+def here(state: Vector) -> inputs.PositionYaw:
     """Return the current position and heading."""
-    return PositionYaw(triple(state, P), quat_yaw(state[Q:RATES]))
+    return inputs.PositionYaw(triple(state, P), quat_yaw(state[Q:RATES]))
 
 
-def over(place: PositionYaw, down_m_s: float) -> Demand:
+def over(place: inputs.PositionYaw, down_m_s: float) -> Demand:
     """Return the demand that holds a place and heading at a vertical speed NED [m/s]."""
     north, east, _ = place.position
     return Demand((north, east, NAN), (NAN, NAN, down_m_s), place.yaw, NAN)

@@ -30,15 +30,7 @@ from firmware_sim.autopilot.guidance import Home
 from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, Reposition
 from firmware_sim.autopilot.modes.interface import FlightContext, here
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
-from firmware_sim.autopilot.navigation.plan import (
-    Crew,
-    Missions,
-    MissionType,
-    NavigationState,
-    PlanItem,
-    Plans,
-    distance_m,
-)
+from firmware_sim.autopilot.navigation import plan
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.autopilot.smooth_trajectory import Axis, triple
 
@@ -60,12 +52,12 @@ _WARN = 1
 class Navigator:
     """Navigator: monitors the fence and runs missions."""
 
-    def __init__(self, plans: Plans, value: Callable[[str], float], crew: Crew) -> None:
+    def __init__(self, plans: plan.Plans, value: Callable[[str], float], crew: plan.Crew) -> None:
         """Store the plans, the look-up for PX4 parameters, and the mission callbacks."""
         self._value, self._crew = value, crew
         self.fence = FenceMonitor(plans, value, crew.say)
         """Fence monitor."""
-        self.missions = Missions()
+        self.missions = plan.Missions()
         """Missions, by an add-on."""
         for place in entries("firmware_sim", "MISSIONS").values():
             self.missions = load(place)(plans, value, crew, self.fence)
@@ -75,14 +67,14 @@ class Navigator:
         """True if steps have no effect until mode, plans, home or parameters change."""
         self._position: Vec | None = None
 
-    def mission_is_valid(self, now: NavigationState | None) -> bool:
+    def mission_is_valid(self, now: plan.NavigationState | None) -> bool:
         """Return whether the mission is feasible, as required by Mission mode."""
         if now is not None:
             self.missions.review(now)
         return self.missions.valid
 
     def permitted(
-        self, request: ModeRequest | None, now: NavigationState | None
+        self, request: ModeRequest | None, now: plan.NavigationState | None
     ) -> ModeRequest | None:
         """Return a request, or None with a text if the geofence forbids the place.
 
@@ -99,7 +91,7 @@ class Navigator:
         self._crew.say(OperatorText.of(Severity.CRITICAL, why))
         return None
 
-    def return_place(self, now: NavigationState, home: PositionYaw) -> PositionYaw | None:
+    def return_place(self, now: plan.NavigationState, home: PositionYaw) -> PositionYaw | None:
         """Return the destination of Return; its height is the ground's.
 
         None if Return flies mission items instead.
@@ -127,7 +119,7 @@ class Navigator:
         return return_time_s(self._value, height, away)
 
     def step(
-        self, now: NavigationState, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
+        self, now: plan.NavigationState, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
     ) -> None:
         """Advance by a period; `place` returns the vehicle's position for the geofence."""
         self.due_us = now.time_us + (PERIOD_US if mode in _LED else IDLE_US)
@@ -152,14 +144,14 @@ class Whereabouts:
         self._estimator, self._sensors, self._home = estimator, sensors, home
         self._value = value
 
-    def situation(self, *, landed: bool) -> NavigationState | None:
+    def situation(self, *, landed: bool) -> plan.NavigationState | None:
         """Return the flight state for missions; None before the first fix."""
         sample, home, origin = self._sensors.sample, self._home.place, self._estimator.origin
         if sample is None or home is None or origin is None:
             return None
         state = self._estimator.state
         place, velocity = here(state), triple(state, V)
-        return NavigationState(
+        return plan.NavigationState(
             sample.time_us, place.position, place.yaw, landed, home, origin, velocity
         )
 
@@ -213,13 +205,13 @@ class Circle(NamedTuple):
 
     def contains(self, latitude_deg: float, longitude_deg: float) -> bool:
         """Return whether a place is inside the circle."""
-        return distance_m(self.center, (latitude_deg, longitude_deg)) < self.radius_m
+        return plan.distance_m(self.center, (latitude_deg, longitude_deg)) < self.radius_m
 
 
 Area: TypeAlias = "Polygon | Circle"
 
 
-def areas(items: Sequence[PlanItem]) -> Iterator[Area]:
+def areas(items: Sequence[plan.PlanItem]) -> Iterator[Area]:
     """Yield the polygons and circles of a stored fence; other items are skipped."""
     index = 0
     while index < len(items):
@@ -294,7 +286,10 @@ class FenceMonitor:
     """Fence storage and breach monitor."""
 
     def __init__(
-        self, plans: Plans, value: Callable[[str], float], say: Callable[[OperatorText], object]
+        self,
+        plans: plan.Plans,
+        value: Callable[[str], float],
+        say: Callable[[OperatorText], object],
     ) -> None:
         """Store the plans, the look-up for PX4 parameters, and the text callback."""
         self._plans, self._value, self._say = plans, value, say
@@ -311,9 +306,9 @@ class FenceMonitor:
         far, high = self._limits(place, home)
         return not (far or high) and all_allow(self._areas, place)
 
-    def step(self, now: NavigationState, mode: Mode, place: Callable[[], Geodetic]) -> None:
+    def step(self, now: plan.NavigationState, mode: Mode, place: Callable[[], Geodetic]) -> None:
         """Check the fence if due; `place` returns the position selected by GF_SOURCE."""
-        if self._plans.stored(MissionType.FENCE).revision != self._revision:
+        if self._plans.stored(plan.MissionType.FENCE).revision != self._revision:
             self._take(now, place)
         if now.time_us < self._due_us:
             return
@@ -353,12 +348,12 @@ class FenceMonitor:
     def _limits(self, place: Geodetic, home: Geodetic) -> tuple[bool, bool]:
         """Return whether a place exceeds the distance from home, and the height above it."""
         farthest, highest = self._value("GF_MAX_HOR_DIST"), self._value("GF_MAX_VER_DIST")
-        far = farthest > 0.0 and distance_m(place[:2], home[:2]) >= farthest
+        far = farthest > 0.0 and plan.distance_m(place[:2], home[:2]) >= farthest
         return far, highest > 0.0 and place.altitude_m - home.altitude_m >= highest
 
-    def _take(self, now: NavigationState, place: Callable[[], Geodetic]) -> None:
+    def _take(self, now: plan.NavigationState, place: Callable[[], Geodetic]) -> None:
         """Load a new fence, without areas that home or the flying vehicle violates."""
-        fence = self._plans.stored(MissionType.FENCE)
+        fence = self._plans.stored(plan.MissionType.FENCE)
         self._revision = fence.revision
         accepted = []
         for area in areas(fence.items):

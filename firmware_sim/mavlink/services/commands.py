@@ -19,18 +19,8 @@ from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import (
-    ANY,
-    Action,
-    Context,
-    Handlers,
-    VehicleCommand,
-    for_anyone,
-    for_vehicle,
-    sender,
-    table,
-)
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 NAN = math.nan
@@ -42,7 +32,7 @@ _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 """Range of valid origin altitudes above mean sea level, as in EKF2 [m]."""
 
 
-def _reposition(command: VehicleCommand, context: Context) -> Result:
+def _reposition(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameters 1: speed [m/s], 2: flags, 4: heading [rad], 5..7: position; NaN = keep."""
     # PX4 1.16 supports DO_REPOSITION only with the change-mode flag.
     if command.integer(2) != _CHANGE_MODE:
@@ -56,7 +46,7 @@ def _reposition(command: VehicleCommand, context: Context) -> Result:
     return context.port.set_mode(Mode.HOLD, Reposition(place, speed))
 
 
-def _change_altitude(command: VehicleCommand, context: Context) -> Result:
+def _change_altitude(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameter 1: altitude [m] above mean sea level."""
     nowhere = (NAN, NAN, NAN, NAN, NAN, NAN)
     above = replace(command, params=(*nowhere, command.params[0]))
@@ -64,7 +54,7 @@ def _change_altitude(command: VehicleCommand, context: Context) -> Result:
     return context.port.set_mode(Mode.HOLD, Reposition(place, altitude_alone=True))
 
 
-def _change_speed(command: VehicleCommand, context: Context) -> Result:
+def _change_speed(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameters 1: SPEED_TYPE, 2: speed [m/s]."""
     speed = command.params[1]
     if command.integer(1) == _GROUND_SPEED and speed > 0.0 and math.isfinite(speed):
@@ -72,7 +62,7 @@ def _change_speed(command: VehicleCommand, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _orbit(command: VehicleCommand, context: Context) -> Result:
+def _orbit(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameters 1: radius [m], 2: speed [m/s], 3: ORBIT_YAW_BEHAVIOUR, 5..7: centre."""
     radius, speed = (p if math.isfinite(p) else NAN for p in command.params[:2])
     request = OrbitRequest(local_place(command, context), radius, speed, command.integer(3))
@@ -82,7 +72,7 @@ def _orbit(command: VehicleCommand, context: Context) -> Result:
     return result
 
 
-def local_place(command: VehicleCommand, context: Context) -> Vec:
+def local_place(command: services.VehicleCommand, context: services.Context) -> Vec:
     """Return parameters 5 to 7 in local NED [m]; NaN if unset or unknown."""
     latitude, longitude, altitude = command.params[4:]
     state = context.port.state()
@@ -100,7 +90,7 @@ def local_place(command: VehicleCommand, context: Context) -> Vec:
     return north, east, down
 
 
-def _set_home(command: VehicleCommand, context: Context) -> Result:
+def _set_home(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameter 1: 1 = current position; otherwise parameters 5 to 7 are the position."""
     if command.params[0] > 0.5:
         return context.port.set_home(None)
@@ -110,7 +100,7 @@ def _set_home(command: VehicleCommand, context: Context) -> Result:
     return context.port.set_home(place)
 
 
-def handle_set_origin(message: WireMessage, context: Context) -> bool:
+def handle_set_origin(message: WireMessage, context: services.Context) -> bool:
     """Handle SET_GPS_GLOBAL_ORIGIN: move the origin of local NED.
 
     Requires this system id and a valid position. Like PX4 1.16, always reply GPS_GLOBAL_ORIGIN.
@@ -144,7 +134,7 @@ _RELATIVE_FRAMES = (
 )
 
 
-def _arm_disarm(command: VehicleCommand, context: Context) -> Result | None:
+def _arm_disarm(command: services.VehicleCommand, context: services.Context) -> Result | None:
     force = command.integer(2) == FORCE_MAGIC
     if command.integer(1) == 1:
         if any(state.forbids_arming for state in context.vehicle_states.values()):
@@ -160,7 +150,7 @@ def _arm_disarm(command: VehicleCommand, context: Context) -> Result | None:
     return None
 
 
-def _takeoff(command: VehicleCommand, context: Context) -> Result:
+def _takeoff(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle NAV_TAKEOFF, parameters 5, 6: target; 7: altitude above mean sea level [m].
 
     In a relative frame the altitude is above home. NaN = vertical takeoff to MIS_TAKEOFF_ALT.
@@ -178,7 +168,7 @@ def _takeoff(command: VehicleCommand, context: Context) -> Result:
     return context.port.takeoff(altitude - home.altitude_m, place)
 
 
-def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
+def _change_mode(base: int, main: int, sub: int, context: services.Context) -> Result:
     """Change the mode, given MAV_MODE_FLAG bits, PX4's main mode and sub mode."""
     request = requested_mode(base, main, sub)
     if isinstance(request, OperatorText):
@@ -187,7 +177,7 @@ def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
     return Result.ACCEPTED if request is None else context.port.set_mode(request)
 
 
-def _set_standard_mode(command: VehicleCommand, context: Context) -> Result:
+def _set_standard_mode(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle DO_SET_STANDARD_MODE, parameter 1: MAV_STANDARD_MODE; FAILED if unsupported."""
     asked, custom = command.integer(1) or 0, dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     # NON_STANDARD is 0, also the value of an unset parameter.
@@ -198,29 +188,29 @@ def _set_standard_mode(command: VehicleCommand, context: Context) -> Result:
     return Result.FAILED
 
 
-def _set_mode(command: VehicleCommand, context: Context) -> Result:
+def _set_mode(command: services.VehicleCommand, context: services.Context) -> Result:
     base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
     return _change_mode(base, main, sub, context)
 
 
-def _terminate(command: VehicleCommand, context: Context) -> Result:
+def _terminate(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle DO_FLIGHTTERMINATION: stop the motors permanently; DENIED unless armed (PX4)."""
     wanted = command.params[0] > TERMINATE_FROM
     return context.port.terminate() if wanted else Result.DENIED
 
 
-def _run_checks(_command: VehicleCommand, context: Context) -> Result:
+def _run_checks(_command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle RUN_PREARM_CHECKS: report the failed checks again."""
     context.port.tell_checks()
     return Result.ACCEPTED
 
 
-def _reboot(command: VehicleCommand, _context: Context) -> Result:
+def _reboot(command: services.VehicleCommand, _context: services.Context) -> Result:
     """Handle a reboot request: PX4 SITL accepts only "do nothing", armed or not."""
     return Result.ACCEPTED if command.integer(1) == 0 else Result.DENIED
 
 
-def _mode(mode: Mode) -> Action:
+def _mode(mode: Mode) -> services.Action:
     """Return the action of a command that requests one mode."""
     return lambda _, context: context.port.set_mode(mode, commanded=True)
 
@@ -228,7 +218,7 @@ def _mode(mode: Mode) -> Action:
 _REQUEST_CAPABILITIES: int = dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
 _REQUEST_PROTOCOL: int = dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION
 
-ACTIONS: dict[int, Action] = {
+ACTIONS: dict[int, services.Action] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
     dialect.MAV_CMD_NAV_LAND: _mode(Mode.LAND),
@@ -248,22 +238,28 @@ ACTIONS: dict[int, Action] = {
 """Actions by command. Commands without an action in any service are UNSUPPORTED."""
 
 
-def handle_command_long(message: WireMessage, context: Context) -> bool:
+def handle_command_long(message: WireMessage, context: services.Context) -> bool:
     """Execute and acknowledge a COMMAND_LONG."""
-    return _handle(VehicleCommand(message.command, _PARAMS(message), sender(message)), context)
+    return _handle(
+        services.VehicleCommand(message.command, _PARAMS(message), services.sender(message)),
+        context,
+    )
 
 
-def handle_command_int(message: WireMessage, context: Context) -> bool:
+def handle_command_int(message: WireMessage, context: services.Context) -> bool:
     """Execute and acknowledge a COMMAND_INT."""
     # COMMAND_INT has five floats and a position in 1e-7 degrees.
     four = (message.param1, message.param2, message.param3, message.param4)
     given = (message.x, message.y) != (INT32_MAX, INT32_MAX)  # INT32_MAX = unset
     place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
     params = (*four, *place, message.z)
-    return _handle(VehicleCommand(message.command, params, sender(message), message.frame), context)
+    return _handle(
+        services.VehicleCommand(message.command, params, services.sender(message), message.frame),
+        context,
+    )
 
 
-def handle_set_mode(message: WireMessage, context: Context) -> bool:
+def handle_set_mode(message: WireMessage, context: services.Context) -> bool:
     """Execute a SET_MODE, the legacy message without acknowledgement."""
     if message.target_system != context.system_id:
         return False
@@ -273,9 +269,9 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _handle(command: VehicleCommand, context: Context) -> bool:
+def _handle(command: services.VehicleCommand, context: services.Context) -> bool:
     # None means no COMMAND_ACK at all: PX4 leaves some commands unanswered.
-    action = table("ACTIONS").get(command.number)
+    action = services.table("ACTIONS").get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:
         context.link.send(
@@ -284,11 +280,11 @@ def _handle(command: VehicleCommand, context: Context) -> bool:
     return True
 
 
-def is_addressed(message: WireMessage, context: Context) -> bool:
+def is_addressed(message: WireMessage, context: services.Context) -> bool:
     """Return True if a command is for this vehicle. Identity requests may be broadcasts."""
     if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
-        return message.target_system in (context.system_id, ANY)
-    return for_vehicle(message, context)
+        return message.target_system in (context.system_id, services.ANY)
+    return services.for_vehicle(message, context)
 
 
 _CRITICAL = Severity.CRITICAL
@@ -343,9 +339,9 @@ def _from_base_mode(base: int) -> Mode | None:
     return Mode.STABILIZED if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL
 
 
-HANDLERS: Handlers = {
+HANDLERS: services.Handlers = {
     "COMMAND_LONG": (is_addressed, handle_command_long),
     "COMMAND_INT": (is_addressed, handle_command_int),
-    "SET_MODE": (for_anyone, handle_set_mode),
-    "SET_GPS_GLOBAL_ORIGIN": (for_anyone, handle_set_origin),
+    "SET_MODE": (services.for_anyone, handle_set_mode),
+    "SET_GPS_GLOBAL_ORIGIN": (services.for_anyone, handle_set_origin),
 }

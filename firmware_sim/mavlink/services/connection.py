@@ -11,20 +11,9 @@ from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.link import OFF
-from firmware_sim.mavlink.services import (
-    ANY,
-    Action,
-    Context,
-    Handlers,
-    VehicleCommand,
-    for_anyone,
-    for_vehicle,
-    for_vehicle_or_all,
-    sender,
-    table,
-)
 from firmware_sim.mavlink.streams import Builder
 from firmware_sim.mavlink.streams.units import INT32_MAX
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
@@ -40,7 +29,7 @@ OF_MISSING_DEVICES = frozenset((370, 371))
 sends nothing, because it lacks the devices. PX4 also accepts a NaN id."""
 
 
-def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
+def _set_message_interval(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameter 1: message id; 2: interval [µs], 0 or unset = default, negative = off."""
     number = command.integer(1)
     # PX4 accepts the rate of a missing device without effect.
@@ -63,15 +52,15 @@ def _set_message_interval(command: VehicleCommand, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def _get_message_interval(command: VehicleCommand, context: Context) -> Result:
+def _get_message_interval(command: services.VehicleCommand, context: services.Context) -> Result:
     return _send_interval((command.integer(1) or 0) & 0xFFFF, context)
 
 
-def _request_message(command: VehicleCommand, context: Context) -> Result:
+def _request_message(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle parameter 1: message id; 2: parameter of the message."""
     number = command.integer(1) or 0
     # Some messages take a parameter or are not streams.
-    special = table("REQUESTS").get(number)
+    special = services.table("REQUESTS").get(number)
     if special is not None:
         result: Result = special(command, context)
         return result
@@ -79,18 +68,18 @@ def _request_message(command: VehicleCommand, context: Context) -> Result:
     return Result.DENIED if name is None else send_stream(name, context)
 
 
-def _request_interval(command: VehicleCommand, context: Context) -> Result:
+def _request_interval(command: services.VehicleCommand, context: services.Context) -> Result:
     number = command.integer(2)
     return Result.DENIED if number is None else _send_interval(number & 0xFFFF, context)
 
 
-REQUESTS: dict[int, Action] = {
+REQUESTS: dict[int, services.Action] = {
     dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL: _request_interval,
 }
 """Messages that are not streams, or whose request has parameters."""
 
 
-def send_stream(name: str, context: Context) -> Result:
+def send_stream(name: str, context: services.Context) -> Result:
     """Send a streamed message now; DENIED = no content, UNSUPPORTED = unknown message."""
     if name not in context.link.builders:
         return Result.UNSUPPORTED
@@ -98,13 +87,13 @@ def send_stream(name: str, context: Context) -> Result:
     return Result.ACCEPTED if sent else Result.DENIED
 
 
-def _stream_name(number: int | None, context: Context) -> str | None:
+def _stream_name(number: int | None, context: services.Context) -> str | None:
     """Return the name of the stream with a message id; None if unknown."""
     name = None if number is None else message_name(number)
     return name if name in context.link.builders else None
 
 
-def _send_interval(number: int, context: Context) -> Result:
+def _send_interval(number: int, context: services.Context) -> Result:
     name, interval = _stream_name(number, context), _INTERVAL_UNAVAILABLE
     if name is not None:
         interval = context.link.scheduler.interval_us(name)
@@ -113,7 +102,7 @@ def _send_interval(number: int, context: Context) -> Result:
     return Result.ACCEPTED
 
 
-def handle_event(request: WireMessage, context: Context) -> bool:
+def handle_event(request: WireMessage, context: services.Context) -> bool:
     """Handle REQUEST_EVENT: resend events, or RESPONSE_EVENT_ERROR for each expired event."""
     first, last = request.first_sequence, request.last_sequence
     # Limited: the first error reply already contains the oldest available number.
@@ -134,12 +123,12 @@ def handle_event(request: WireMessage, context: Context) -> bool:
     return True
 
 
-def _sends(name: str) -> Action:
+def _sends(name: str) -> services.Action:
     """Return the action that sends a stream's message."""
     return lambda _, context: send_stream(name, context)
 
 
-ACTIONS: dict[int, Action] = {
+ACTIONS: dict[int, services.Action] = {
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_message_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_message_interval,
     dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
@@ -150,25 +139,25 @@ ACTIONS: dict[int, Action] = {
 }
 
 
-def handle_heartbeat(message: WireMessage, context: Context) -> bool:
+def handle_heartbeat(message: WireMessage, context: services.Context) -> bool:
     """Report a ground station's heartbeat to the autopilot (PX4's data link loss), and no other."""
     if message.type == dialect.MAV_TYPE_GCS:
         context.port.gcs_heartbeat(context.now_us)
     return True
 
 
-def handle_ping(message: WireMessage, context: Context) -> bool:
+def handle_ping(message: WireMessage, context: services.Context) -> bool:
     """Return a request (target 0/0) to its sender. Replies to our requests need no action."""
     # Other targets are replies, or requests to another system.
-    if (message.target_system, message.target_component) != (ANY, ANY):
+    if (message.target_system, message.target_component) != (services.ANY, services.ANY):
         return False
     context.link.send(
-        dialect.MAVLink_ping_message(message.time_usec, message.seq, *sender(message))
+        dialect.MAVLink_ping_message(message.time_usec, message.seq, *services.sender(message))
     )
     return True
 
 
-def handle_timesync(message: WireMessage, context: Context) -> bool:
+def handle_timesync(message: WireMessage, context: services.Context) -> bool:
     """Answer a request (tc1 = 0) with the vehicle's time [ns]. Replies need no action.
 
     Peers can measure the offset to the vehicle's clock (simulated time since boot).
@@ -182,10 +171,10 @@ def handle_timesync(message: WireMessage, context: Context) -> bool:
 def ping_requests() -> Builder:
     """Return the builder of one link's PING stream, with numbered requests."""
     sequence = count()
-    return lambda state: (state.time_us, next(sequence) & 0xFFFF_FFFF, ANY, ANY)
+    return lambda state: (state.time_us, next(sequence) & 0xFFFF_FFFF, services.ANY, services.ANY)
 
 
-def handle_setup(message: WireMessage, context: Context) -> bool:
+def handle_setup(message: WireMessage, context: services.Context) -> bool:
     """Handle SETUP_SIGNING: replace the signing key; all zeros remove it.
 
     As in PX4 (PR 25284), an unsigned message is accepted only without a key, and never while armed.
@@ -201,16 +190,16 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
     else:
         # Other operators must notice a change of the key.
         what = "set" if any(key) else "removed"
-        system, component = sender(message)
+        system, component = services.sender(message)
         text = f"Signing key {what} by system {system} component {component}"
         context.announce(OperatorText(Severity.NOTICE, text))
     return True
 
 
-HANDLERS: Handlers = {
-    "REQUEST_EVENT": (for_vehicle, handle_event),
-    "HEARTBEAT": (for_anyone, handle_heartbeat),
-    "SETUP_SIGNING": (for_vehicle_or_all, handle_setup),
-    "PING": (for_anyone, handle_ping),
-    "TIMESYNC": (for_anyone, handle_timesync),
+HANDLERS: services.Handlers = {
+    "REQUEST_EVENT": (services.for_vehicle, handle_event),
+    "HEARTBEAT": (services.for_anyone, handle_heartbeat),
+    "SETUP_SIGNING": (services.for_vehicle_or_all, handle_setup),
+    "PING": (services.for_anyone, handle_ping),
+    "TIMESYNC": (services.for_anyone, handle_timesync),
 }

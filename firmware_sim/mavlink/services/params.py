@@ -8,15 +8,8 @@ import struct
 
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.parameter_store import Parameters, ParameterValue
+from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, crc32part, dialect, param_value, payload
-from firmware_sim.mavlink.services import (
-    Action,
-    Context,
-    Handlers,
-    VehicleCommand,
-    for_vehicle,
-    sender,
-)
 
 HASH_NAME = "_HASH_CHECK"
 """Name of a pseudo parameter: checksum with which ground stations validate cached values."""
@@ -29,7 +22,7 @@ _ERROR_TYPE_MISMATCH = 7
 """MAV_PARAM_ERROR_TYPE_MISMATCH, which pymavlink's dialect lacks."""
 
 
-def send_pending(context: Context) -> None:
+def send_pending(context: services.Context) -> None:
     """Send the next parameters of a running list; call once per tick."""
     if context.next_parameter is None:
         return
@@ -47,14 +40,14 @@ def send_pending(context: Context) -> None:
         context.next_parameter += 1
 
 
-def handle_list(_message: WireMessage, context: Context) -> bool:
+def handle_list(_message: WireMessage, context: services.Context) -> bool:
     """Start sending all parameters."""
     # As in PX4: a client that repeats the request does not need the hash.
     context.next_parameter = -1 if context.next_parameter is None else 0
     return True
 
 
-def handle_read(message: WireMessage, context: Context) -> bool:
+def handle_read(message: WireMessage, context: services.Context) -> bool:
     """Send one parameter, by index or by name."""
     store = context.port.parameters
     index: int = message.param_index
@@ -70,7 +63,7 @@ def handle_read(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def handle_set(message: WireMessage, context: Context) -> bool:
+def handle_set(message: WireMessage, context: services.Context) -> bool:
     """Set a parameter, and send its new value on all links."""
     if message.param_id == HASH_NAME:
         context.next_parameter = None  # the client's cached values are valid: stop the list
@@ -94,10 +87,13 @@ def handle_set(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _send_error(message: WireMessage, index: int, error: int, context: Context) -> None:
+def _send_error(message: WireMessage, index: int, error: int, context: services.Context) -> None:
     context.link.send(
         dialect.MAVLink_param_error_message(
-            *sender(message), message.param_id.encode("ascii", errors="replace"), index, error
+            *services.sender(message),
+            message.param_id.encode("ascii", errors="replace"),
+            index,
+            error,
         )
     )
 
@@ -148,7 +144,7 @@ def _hash_of(store: Parameters, _revision: int) -> int:
 _LOAD, _SAVE, _RESET, _RESET_SENSORS, _FACTORY_RESET = range(5)
 
 
-def _store(command: VehicleCommand, context: Context) -> Result | None:
+def _store(command: services.VehicleCommand, context: services.Context) -> Result | None:
     """Handle parameter 1: action. PX4 does not acknowledge unknown actions."""
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
@@ -166,10 +162,10 @@ def _store(command: VehicleCommand, context: Context) -> Result | None:
     return Result.ACCEPTED
 
 
-ACTIONS: dict[int, Action] = {dialect.MAV_CMD_PREFLIGHT_STORAGE: _store}
+ACTIONS: dict[int, services.Action] = {dialect.MAV_CMD_PREFLIGHT_STORAGE: _store}
 
-HANDLERS: Handlers = {
-    "PARAM_REQUEST_LIST": (for_vehicle, handle_list),
-    "PARAM_REQUEST_READ": (for_vehicle, handle_read),
-    "PARAM_SET": (for_vehicle, handle_set),
+HANDLERS: services.Handlers = {
+    "PARAM_REQUEST_LIST": (services.for_vehicle, handle_list),
+    "PARAM_REQUEST_READ": (services.for_vehicle, handle_read),
+    "PARAM_SET": (services.for_vehicle, handle_set),
 }

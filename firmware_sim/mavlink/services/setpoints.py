@@ -13,11 +13,7 @@ import math
 import numpy as np
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
-from airl_mav.core.frames import (
-    Geodetic,
-    geodetic_to_local,
-    quat_to_euler,
-)
+from airl_mav.core import frames
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Severity, Vector, Wire
 from firmware_sim.autopilot.events import flight_events as events
@@ -106,7 +102,7 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
         yaw_rate = 0.0 if ignored else _or_zero(message.body_yaw_rate)
         demand = AttitudeDemand((w, x, y, z), yaw_rate, thrust)
         # The wire tuple repeats what the client sent, for records.
-        wire = (*quat_to_euler(q / norm), thrust)
+        wire = (*frames.quat_to_euler(q / norm), thrust)
     elif not mask & (
         dialect.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
         | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
@@ -176,8 +172,8 @@ def _from_globe(message: WireMessage, above: int, context: Context) -> Vector | 
         return None
     # The altitude is above sea level, or above home in the relative frame.
     altitude = message.alt + (home.altitude_m if above == _ABOVE_HOME else 0.0)
-    place = Geodetic(message.lat_int / 1e7, message.lon_int / 1e7, altitude)
-    return geodetic_to_local(place, origin)
+    place = frames.Geodetic(message.lat_int / 1e7, message.lon_int / 1e7, altitude)
+    return frames.geodetic_to_local(place, origin)
 
 
 def _thrust(message: WireMessage) -> float:
@@ -290,8 +286,8 @@ def handle_follow_target(message: WireMessage, context: Context) -> bool:
     # PX4 treats latitude and longitude 0 as no position.
     if origin is None or (message.lat, message.lon) == (0, 0):
         return False
-    place = Geodetic(message.lat / 1e7, message.lon / 1e7, message.alt)
-    north, east, down = geodetic_to_local(place, origin).tolist()
+    place = frames.Geodetic(message.lat / 1e7, message.lon / 1e7, message.alt)
+    north, east, down = frames.geodetic_to_local(place, origin).tolist()
     vn, ve, vd = message.vel if message.est_capabilities & _HAS_VELOCITY else (0.0, 0.0, 0.0)
     if not all(map(math.isfinite, (north, east, down, vn, ve, vd))):
         return False

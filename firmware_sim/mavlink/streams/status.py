@@ -14,12 +14,8 @@ import numpy as np
 
 from airl_mav.core.addons import entries
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
+from firmware_sim.autopilot import flight_modes
 from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Landed
-from firmware_sim.autopilot.flight_modes import (
-    MAIN_AUTO,
-    WITH_STICKS,
-    Mode,
-)
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
@@ -407,9 +403,9 @@ def base_mode(status: CommanderStatus) -> int:
     bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if status.mode.spec.stabilized:
         bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-    if status.mode.spec.main == MAIN_AUTO:
+    if status.mode.spec.main == flight_modes.MAIN_AUTO:
         bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
-    if status.mode in WITH_STICKS:
+    if status.mode in flight_modes.WITH_STICKS:
         bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
     if status.arming is Arming.ARMED:
         bits |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
@@ -422,7 +418,7 @@ def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
     Armed: ACTIVE, or CRITICAL in a failsafe. Disarmed: STANDBY, or UNINIT if the mode cannot be
     armed. After a termination: FLIGHT_TERMINATION, armed or not.
     """
-    if status.mode is Mode.TERMINATION:
+    if status.mode is flight_modes.Mode.TERMINATION:
         return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
     if status.arming is Arming.ARMED:
         # ACTIVE or CRITICAL applies only to an armed vehicle.
