@@ -3,7 +3,7 @@
 Runs the flights and trainings of experiments as Ray tasks. Restarts lost tasks.
 Option: `--executor ray` of `airl evaluate`, `gap`, `degrade`, `ladder` and `sweep`.
 Depends on: `airl_mav.experiments.executors` and the extra `ray`.
-Guide: docs/how-to/ray.md.
+Guide: docs/how-to/cluster.md.
 """
 
 EXECUTORS = {"ray": "airl_mav.addons.ray.executor"}
