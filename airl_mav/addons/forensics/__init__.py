@@ -4,7 +4,7 @@ Ranks the flights of a run and names the cause of each: hit out of the picture, 
 stop, swung on the spot, passed the goal. Used by the sections "Worst flights" and "Flights" of a
 run's page (`airl report`).
 Depends on: `airl_mav.report`, `airl_mav.envs.stopping`.
-Guide: docs/report.md.
+Guide: docs/how-to/run-report.md.
 """
 
 FORENSICS = {
