@@ -6,7 +6,7 @@ noise and JPEG of an image sensor. Used by cameras of kind rgb and grey, by the 
 of arenas and `imaging` of cameras, and by `--renderer mitsuba`.
 Command: `airl render`.
 Depends on: the extra `render` for path tracing, `film` for videos.
-Guide: docs/how-to/camera.md.
+Guide: docs/explanation/colour.md.
 """
 
 _HERE = "airl_mav.addons.colour"

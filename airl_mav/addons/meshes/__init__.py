@@ -3,7 +3,7 @@
 Cameras see the mesh, plants and planners use the boxes. Reads STL, OBJ, GLB, glTF, PLY and OFF.
 Command: `airl asset`.
 Depends on: the extra `mesh` (trimesh).
-Guide: docs/how-to/arena.md.
+Guide: docs/how-to/arena-assets.md.
 """
 
 COMMANDS = {
