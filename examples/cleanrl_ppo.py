@@ -1,11 +1,11 @@
-"""PPO in one file, in the manner of CleanRL: no learner but this loop, 16 flights at a time.
+"""PPO in one file, in the style of CleanRL, with 16 parallel flights.
 
     python examples/cleanrl_ppo.py
     airl export examples/cleanrl_ppo.py:Agent --weights agent.pt --out policies/agent
     airl evaluate policies/agent --arena no-obstacles
 
-STEPS is too short to learn anything: with 60,000, a minute, almost every flight reaches the goal of
-this empty arena. Needs the extra `train`.
+With STEPS = 60,000 (a minute) almost every flight reaches the goal of this empty arena. Needs the
+extra `train`.
 """
 
 import gymnasium
@@ -34,11 +34,11 @@ class Agent(nn.Module):
         return self.body(torch.cat([self.eye(depth / 255.0), velocity, goal], dim=1))
 
     def forward(self, depth, velocity, goal):
-        """What flies: a score for each action."""
+        """Return a score for each action: the exported network."""
         return self.actor(self.features(depth, velocity, goal))
 
     def judge(self, seen):
-        """What learns: the distribution of actions, and the value."""
+        """Return the distribution of actions and the value, for training."""
         features = self.features(seen["depth"], seen["velocity"], seen["goal"])
         return Categorical(logits=self.actor(features)), self.critic(features).squeeze(1)
 
@@ -68,7 +68,7 @@ def train():
                 choice, value = agent.judge(seen)
                 action = choice.sample()
                 following, reward, terminated, truncated, info = env.step(action.numpy())
-                # An episode that ends begins anew in the same step.
+                # SAME_STEP autoreset: a finished flight restarts in this step.
                 done = torch.from_numpy(terminated | truncated)
                 paid = torch.from_numpy(reward).float()
                 steps.append((seen, action, choice.log_prob(action), value, paid, done))

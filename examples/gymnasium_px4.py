@@ -1,4 +1,4 @@
-"""Learn in the batch twin, then fly what was learned in lockstep, by PX4 if there is one.
+"""Train in the vectorized simulator, then fly the policy in lockstep, with PX4 if given.
 
     python examples/gymnasium_px4.py [PX4_SITL_BUILD]
 
@@ -17,12 +17,12 @@ KNOBS = {"arena": "no-obstacles", "actions": "velocity"}
 
 
 def main() -> None:
-    """Learn, and fly three episodes everywhere."""
-    twin = NavigationVecEnv(NavigationVectorEnv(64, **KNOBS))
-    learner = PPO("MultiInputPolicy", twin, n_steps=32, batch_size=512, seed=1, device="cpu")
+    """Train, then fly three episodes in each simulator."""
+    vectorized = NavigationVecEnv(NavigationVectorEnv(64, **KNOBS))
+    learner = PPO("MultiInputPolicy", vectorized, n_steps=32, batch_size=512, seed=1, device="cpu")
     learner.learn(30_000)
     places = {
-        "twin": gymnasium.make("airl_mav:airl/Navigation-v0", **KNOBS),
+        "vectorized": gymnasium.make("airl_mav:airl/Navigation-v0", **KNOBS),
         "built-in": gymnasium.make("airl_mav:airl/Rehearsal-v0", **KNOBS),
     }
     if sys.argv[1:]:

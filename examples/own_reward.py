@@ -1,7 +1,7 @@
-"""A reward of your own: train with it, and fly the policy.
+"""A custom reward: train with it and fly the policy.
 
-In a training file it is `reward = "examples/own_reward.py:short_and_cheap"`. The training here is
-far too short to learn anything; raise STEPS to 200,000. Needs the extra `train`.
+In a training file: `reward = "examples/own_reward.py:short_and_cheap"`. For a policy that reaches
+the goal raise STEPS to 200,000. Needs the extra `train`.
 """
 
 from pathlib import Path
@@ -22,7 +22,7 @@ def short_and_cheap(step: Step) -> NDArray[np.float64]:
 
 
 if __name__ == "__main__":
-    # Here, because whoever takes the reward from this file needs no learner.
+    # Imported here: the reward alone needs no learner.
     from airl_mav.training.config import TrainingConfig
     from airl_mav.training.training_run import train
 

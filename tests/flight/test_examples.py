@@ -77,12 +77,13 @@ def test_own_policy(tmp_path: Path) -> None:
 
 @pytest.mark.nightly  # It learns; the environment itself: test_rehearsal_env.py.
 def test_gymnasium_px4(tmp_path: Path) -> None:
-    """Learned in the twin, it flies there as in lockstep."""
+    """The policy flies in the vectorized simulator as in lockstep."""
     text = output_of("gymnasium_px4.py", tmp_path)
     pattern = r"^{}, seed \d: success after ([\d.]+) s and [\d.]+ m$"
-    in_twin, built_in = (numbers_after(pattern.format(who), text) for who in ("twin", "built-in"))
-    assert len(in_twin) == len(built_in) == 3, text
-    np.testing.assert_allclose(built_in, in_twin, rtol=0.1)
+    simulators = ("vectorized", "built-in")
+    vectorized, built_in = (numbers_after(pattern.format(name), text) for name in simulators)
+    assert len(vectorized) == len(built_in) == 3, text
+    np.testing.assert_allclose(built_in, vectorized, rtol=0.1)
 
 
 def test_the_policy_of_own_acceleration_reaches_its_goal() -> None:
