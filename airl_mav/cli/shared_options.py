@@ -84,7 +84,7 @@ class Viewing(ProfileModel):
     view: bool = Field(
         default=False,
         description="show the flights in a browser while they fly, at an address that is printed"
-        " (docs/how-to/view.md); in lockstep they fly in real time unless --speed says otherwise",
+        " (docs/how-to/view-and-export.md); in lockstep they fly in real time, or at --speed",
     )
     view_port: int | None = quantity(
         "TCP port of that page on the loopback address; by default a free one",

@@ -3,7 +3,7 @@
 Writes the flights of a run as files, or sends the flights of a run in progress.
 Command: `airl export-log`.
 Depends on: `airl_mav.black_box`, the add-ons `view` and `firmware_sim.addons.flight_log`.
-Guide: docs/how-to/export-log.md.
+Guide: docs/how-to/view-and-export.md.
 """
 
 COMMANDS = {

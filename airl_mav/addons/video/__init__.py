@@ -3,7 +3,7 @@
 Announces the camera by MAVLink's camera protocol.
 Command: `airl video`. Option: `--video HOST:PORT` of `airl sitl`.
 Depends on: `companion.frame_source`, MAVSDK; the extra `film`.
-Guide: docs/how-to/video.md.
+Guide: docs/how-to/view-and-export.md.
 """
 
 COMMANDS = {

@@ -4,7 +4,7 @@ A view is a process of its own with a page of viser. Flights send it messages, w
 drops, and read its viewers' requests: pace, latency, compensation.
 Commands: `airl view RUN`; option `--view` of `airl-sitl`, `airl evaluate` and `airl train`.
 Depends on: the extra `view` (viser); `airl_mav.report.scene`.
-Guide: docs/how-to/view.md.
+Guide: docs/how-to/view-and-export.md.
 """
 
 COMMANDS = {"view": ("replay the flights of a run in a browser", "airl_mav.addons.view.command")}
