@@ -85,7 +85,8 @@ class Amount:
     def accepted(self) -> str:
         """Return the accepted range as text: "three numbers, -100 <= value <= 100 m"."""
         limits = f"{self.low:g} <= value <= {self.high:g}" + (f" {self.unit}" if self.unit else "")
-        return limits if self.width == 1 else f"three numbers, {limits}"
+        counts = {1: "", 2: "two numbers, ", 3: "three numbers, "}
+        return f"{counts[self.width]}{limits}"
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,7 @@ def test_what_people_write(written: str, meant: str) -> None:
         ("gps bias 1m", "accepted: three numbers, -100000 <= value <= 100000 m"),
         ("gps bias 1,2,3", "written with m"),
         ("gps bias 1,nan,3m", "accepted: three numbers"),
+        ("flow bias 1rad/s", "accepted: two numbers, -35 <= value <= 35 rad/s"),
         ("gps noise 0.5x", "accepted: 1 <= value <= 1000"),
         ("gps noise", "none: accepted"),
         ("gps off at 8", "accepted: a time as 8s or 500ms, or a phase"),
