@@ -3,7 +3,7 @@
 Vehicle and companion pass turns as texts over their MAVLink connection.
 Options: `airl-firmware --lockstep`, `airl-companion --lockstep`.
 Depends on: `airl_mav.lockstep`; the companion's side needs no simulator.
-Guide: docs/how-to/lockstep-client.md; protocol: docs/reference/lockstep-protocol.md.
+Guide: docs/explanation/lockstep.md; protocol: docs/reference/lockstep-protocol.md.
 """
 
 LOCKSTEP = {
