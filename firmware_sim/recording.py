@@ -208,7 +208,7 @@ class FlightRecorder:
             self._estimated_us.append(flown["time_us"][sampled])
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""
+        """Return the recorded arrays by name in the episode file (docs/reference/run-folder.md)."""
         arrays: dict[str, NDArray[Any]] = {
             "tick/lateness_us": np.array(self._lateness_us, np.int64),
             "tick/slips_us": np.array(self._slips, np.int64).reshape(-1, 2),

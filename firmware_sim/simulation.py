@@ -396,7 +396,7 @@ class Simulation:
             camera.offer(time_us, motion, publish)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the recorded arrays by name in the episode file (docs/run-folder.md)."""
+        """Return the recorded arrays by name in the episode file (docs/reference/run-folder.md)."""
         self._record()
         if self.recorder is None:
             return {}

@@ -1,8 +1,8 @@
 """Evaluation of a policy in seeded episodes, and records of its flights.
 
 Also for model selection. `Trace` records a flight's path at 50 Hz and the timestamps of its
-decisions. The files have the format of a rehearsal (docs/run-folder.md), so all levels use the same
-report.
+decisions. The files have the format of a rehearsal (docs/reference/run-folder.md), so all levels
+use the same report.
 """
 
 from __future__ import annotations

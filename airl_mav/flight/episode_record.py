@@ -59,7 +59,7 @@ class Setup:
 
 
 SCHEMA = 1
-"""Version of the line's schema; docs/run-folder.md describes it."""
+"""Version of the line's schema; docs/reference/run-folder.md describes it."""
 
 NO_ARENA = ""
 """Arena name of a flight outside of all arenas."""

@@ -1,7 +1,7 @@
 """Folder of a new or resumed run. A kill loses no saved episode.
 
-docs/run-folder.md describes every file. An episode is committed by its line in `episodes.jsonl`,
-which is written last. Arrays without a line belong to an unfinished episode.
+docs/reference/run-folder.md describes every file. An episode is committed by its line in
+`episodes.jsonl`, which is written last. Arrays without a line belong to an unfinished episode.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class FlownEpisode:
     trajectory: Trajectory
     """True path."""
     latency: Mapping[str, NDArray[Any]]
-    """Raw stamps by column; see docs/run-folder.md."""
+    """Raw stamps by column; see docs/reference/run-folder.md."""
 
 
 class RunFolder:

@@ -24,7 +24,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.document import environment
 
 SCHEMA = 1
-"""Schema version of `verdict.json`, described in docs/run-folder.md."""
+"""Schema version of `verdict.json`, described in docs/reference/run-folder.md."""
 
 VERDICT_FILE = "verdict.json"
 

@@ -224,7 +224,7 @@ def test_the_commit_of_a_checkout(tmp_path: Path) -> None:
 def test_the_example_in_the_documentation_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = Path(__file__).parents[2] / "docs" / "run-folder.md"
+    page = Path(__file__).parents[2] / "docs" / "reference" / "run-folder.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (folder,) = re.findall(r'load_run\("(.*?)"\)', code)
     monkeypatch.chdir(tmp_path)
@@ -236,7 +236,8 @@ def test_the_example_in_the_documentation_runs(
 
 
 def test_the_documentation_names_every_field(tmp_path: Path) -> None:
-    text = (Path(__file__).parents[2] / "docs" / "run-folder.md").read_text(encoding="utf-8")
+    page = Path(__file__).parents[2] / "docs" / "reference" / "run-folder.md"
+    text = page.read_text(encoding="utf-8")
     folder, _ = write_demo_run(tmp_path / "run", episodes=1)
     info = json.loads((folder.path / "run.json").read_text())
     line = json.loads((folder.path / EPISODES_FILE).read_text())

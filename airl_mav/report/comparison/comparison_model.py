@@ -17,7 +17,7 @@ from airl_mav.profiles.loading import PublishedGap, PublishedRun
 T = TypeVar("T")
 
 SCHEMA = 2
-"""Schema version of a comparison's files, described in docs/run-folder.md."""
+"""Schema version of a comparison's files, described in docs/reference/run-folder.md."""
 
 Kind = Literal["compare", "gap", "ladder", "matrix", "degradation"]
 """Kind of comparison and stem of its files: `gap.json`, `gap.html`, `gap.md`."""
