@@ -91,6 +91,10 @@ nightly: $(ALL)  ## All tests, with the long ones of stops and kills
 docs: $(ALL)  ## Build the documentation site into site/ (no network needed)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
+.PHONY: release-check
+release-check:  ## Build sdist and wheel, install each in a clean environment and fly
+	scripts/check-release $(INTERPRETER)
+
 .PHONY: results
 results: $(ALL)  ## Fly again what is published and out of date (QUICK=1: few flights, unpublished)
 	$(BIN)/python scripts/results.py fly $(if $(QUICK),--quick)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.addons import after_import as _after_import
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _EXPORTS = {
     "ExperimentResult": "airl_mav.experiments.experiment",

@@ -52,20 +52,6 @@ def _shipped(records: Records) -> list[tuple[str, FlownRun]]:
     return [(name, records[record].runs[run]) for name, (record, run) in SHIPPED.items()]
 
 
-@block("policies-short", *RECORDS)
-def policies_short(records: Records) -> str:
-    rows = []
-    for name, run in _shipped(records):
-        card = find_policy(name).card
-        assert card is not None
-        maker = _MAKERS[card.algorithm]
-        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
-        title = f"`{name}`" + (" (default)" if name == DEFAULT_POLICY else "")
-        cells = (title, maker, f"`{run.arena}`{late}", f"{rate(run)} %")
-        rows.append((*cells, f"{number(run.flight_time_s, 2)} s"))
-    return table(("policy", "algorithm", "flown in", "success", "flight time"), rows)
-
-
 @block("policies", *RECORDS)
 def policies(records: Records) -> str:
     rows = []

@@ -77,7 +77,7 @@ def test_an_older_behaviour_is_said_under_its_tables(
 ) -> None:
     today, records = fresh, {**records, "gap": fresh}
     older = today.model_copy(update={"made": today.made.model_copy(update={"behaviour": "0" * 16})})
-    text = "<!-- results: gap-short -->\n<!-- end of results -->"
+    text = "<!-- results: mitigation-gaps -->\n<!-- end of results -->"
     assert "before today" not in pages.rendered(text, records, "page")
     said = pages.rendered(text, {**records, "gap": older}, "page")
     made = today.made
@@ -93,7 +93,7 @@ def test_a_page_with_a_provenance_block_lists_its_commands_there(
     records = {**records, "gap": fresh}
     marks = "".join(
         f"<!-- results: {name} -->\n<!-- end of results -->\n"
-        for name in ("gap-short", "mitigation-runs", "provenance")
+        for name in ("mitigation-gaps", "mitigation-runs", "provenance")
     )
     tables, listed = pages.rendered(marks, records, "page").split("<!-- results: provenance -->")
     assert "airl " not in tables and tables.count("`results/gap.json`") == 2
@@ -181,9 +181,9 @@ def test_the_changes_written_down_name_flights_that_are_flown_and_results_that_a
 @pytest.mark.parametrize(
     "text",
     [
-        "<!-- results: gap-short -->",
+        "<!-- results: mitigation-gaps -->",
         "<!-- results: no-such-block -->\n<!-- end of results -->",
-        "a word <!-- results: gap-short -->\n<!-- end of results -->",
+        "a word <!-- results: mitigation-gaps -->\n<!-- end of results -->",
         "<!-- end of results -->",
     ],
 )

@@ -1,0 +1,240 @@
+"""Galleries of the documentation: every built-in arena, vehicle and policy with a picture.
+
+    python scripts/gallery.py           # writes docs/gallery/*.md and docs/images/gallery/*.png
+    python scripts/gallery.py --pages   # writes the pages only, from profiles and policy cards
+
+The commands under the pictures are the ones that draw them.
+Also draws docs/images/hardware-gap.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from PIL import Image
+
+from airl_mav import Scenario, rehearse
+from airl_mav.arena.draw import draw_arena
+from airl_mav.cli import main as commands
+from airl_mav.core.files import replace_file
+from airl_mav.policy.registry import find_policy, policy_names
+from airl_mav.profiles import loading
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report import run_figures, theme
+from airl_mav.report.run_arenas import arena_of
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ROOT / "docs" / "gallery"
+PICTURES = ROOT / "docs" / "images" / "gallery"
+
+SEED = 7
+GAP = Scenario(policy="static-obstacles", workload="template-5x32", level="gym", episodes=1, seed=7)
+WIDTH_PX = 480
+COLOURS = 128
+
+COMPUTERS = {
+    "workstation": ("workstation, 11 ms", theme.SERIES),
+    "ras-pi-4": ("Raspberry Pi 4, 396 ms", theme.MARK),
+}
+"""Labels and colours of the paths in the picture of the hardware gap."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One part of a gallery."""
+
+    name: str
+    description: str
+    facts: str
+    commands: tuple[str, ...]
+    pictures: dict[str, Callable[[Path], None]]
+    """Functions that write the pictures, by file name."""
+
+
+def arenas() -> list[Entry]:
+    """Return all arenas: a map and the view of a colour camera at the start."""
+    entries = []
+    for name in loading.list_profiles("arenas"):
+        plan = f"airl arena {name} --seed {SEED} --png map.png"
+        view = f"airl render {name} --seed {SEED} --width-px 480 --height-px 320 --out view.png"
+        spec = loading.load_profile("arenas", name, ArenaSpec)
+        size = f"{spec.size.north_m:g} x {spec.size.east_m:g} m"
+        pictures = {
+            f"arena-{name}.png": partial(draw_by_command, plan),
+            f"view-{name}.png": partial(draw_by_command, view),
+        }
+        description = loading.describe_profile("arenas", name)
+        entries.append(Entry(name, description, f"Size: {size}.", (plan, view), pictures))
+    return entries
+
+
+def vehicles() -> list[Entry]:
+    """Return all vehicles, each with an image of its main camera."""
+    entries = []
+    for name in loading.list_profiles("vehicles"):
+        profile = load_vehicle(name)
+        camera, body = profile.camera, profile.body
+        show = "rgb" if camera.kind == "rgb" else "depth"
+        view = (
+            f"airl render dense-obstacles --seed {SEED} --camera {name} --show {show}"
+            " --out view.png"
+        )
+        facts = (
+            f"Mass {body.mass_kg:g} kg. Main camera: {camera.kind}, {camera.width_px} x "
+            f"{camera.height_px} pixels, {camera.horizontal_fov_deg:g}°, {camera.rate_hz:g} Hz."
+        )
+        pictures = {f"vehicle-{name}.png": partial(draw_by_command, view)}
+        description = loading.describe_profile("vehicles", name)
+        check = f"airl vehicle {name}"
+        entries.append(Entry(name, description, facts, (check, view), pictures))
+    return entries
+
+
+def policies() -> list[Entry]:
+    """Return all learned policies, each with a flight in its training arena."""
+    entries = []
+    for name in policy_names():
+        card = find_policy(name).card
+        if card is None or card.training is None:
+            continue
+        environment = card.training.config["environment"]
+        arena, vehicle = card.training.arena, environment["vehicle"]
+        options = f"--arena {arena} --seed {SEED}"
+        options += f" --vehicle {vehicle}" if vehicle != "quad" else ""
+        scenario = Scenario(
+            policy=name, arena=arena, vehicle=vehicle, level="gym", episodes=1, seed=SEED
+        )
+        facts = f"{card.parameters:,} parameters, decides every {card.hold_s:g} s."
+        for result in card.results[:1]:
+            facts += (
+                f" {100.0 * result.success_rate:.1f} % of {result.episodes:,} flights in "
+                f"`{result.arena}` reach the goal."
+            )
+        entries.append(
+            Entry(
+                name,
+                card.description,
+                facts,
+                (f"airl-sitl --policy {name} {options}",),
+                {f"policy-{name}.png": partial(draw_flight, scenario)},
+            )
+        )
+    return entries
+
+
+GALLERIES: dict[str, tuple[str, str, Callable[[], list[Entry]]]] = {
+    "arenas": (
+        "Arenas",
+        "Built-in arenas, from above and as the vehicle sees them at the start. Every seed draws "
+        "another arena of the same kind. Make your own: [arena profiles](../how-to/arena.md).",
+        arenas,
+    ),
+    "vehicles": (
+        "Vehicles",
+        "Built-in vehicles, with an image of the main camera in `dense-obstacles`. Make your own: "
+        "[vehicle profiles](../how-to/vehicle.md).",
+        vehicles,
+    ),
+    "policies": (
+        "Policies",
+        "Built-in policies, with one flight each in the training arena. All results: [shipped "
+        "policies](../shipped-policies.md). Train your own: [training](../how-to/train.md).",
+        policies,
+    ),
+}
+"""Title, introduction and entries of each page."""
+
+
+def page(title: str, introduction: str, entries: Iterable[Entry]) -> str:
+    """Return a gallery page as Markdown."""
+    parts = [f"# {title}\n\n<!-- Written by scripts/gallery.py -->\n\n{introduction}"]
+    for entry in entries:
+        images = "\n".join(
+            f"![{entry.name}](../images/gallery/{file}){{ width=360 }}" for file in entry.pictures
+        )
+        description = entry.description[0].upper() + entry.description[1:]
+        lines = "\n".join(entry.commands)
+        parts.append(
+            f"## {entry.name}\n\n{description}. {entry.facts}\n\n{images}\n\n```sh\n{lines}\n```"
+        )
+    return "\n\n".join(parts) + "\n"
+
+
+def draw_by_command(command: str, path: Path) -> None:
+    """Write the picture of a command that ends in a file name."""
+    *words, _ = command.split()[1:]
+    sys.argv = ["airl", *words, str(path)]
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        commands.airl()
+    shrink(path)
+
+
+def draw_flight(scenario: Scenario, path: Path) -> None:
+    """Fly one episode in the vectorized simulator and write its map."""
+    run = load(rehearse(scenario).path)
+    episode = run.episodes[0]
+    trajectory = run.trajectories[episode.index]
+    speed = float(trajectory.speed().max())
+    path.write_bytes(run_figures.map_figure(episode, trajectory, arena_of(run, episode), speed).png)
+    shrink(path)
+
+
+def draw_gap(path: Path) -> None:
+    """Write the paths of one seed, decided by a workstation and by a Raspberry Pi 4."""
+    figure = theme.new_figure(6.4, 5.6)
+    ax = figure.add_subplot()
+    for computer, (name, colour) in COMPUTERS.items():
+        run = load(rehearse(GAP.model_copy(update={"computer": computer})).path)
+        episode = run.episodes[0]
+        trajectory = run.trajectories[episode.index]
+        arena = arena_of(run, episode)
+        if arena is not None and not ax.patches:
+            draw_arena(arena, ax, goal_radius_m=episode.goal_radius_m)
+        quality = episode.quality
+        label = f"{name}: {quality.distance_m:.0f} m, {quality.flight_time_s:.1f} s"
+        ax.plot(trajectory.position[:, 1], trajectory.position[:, 0], color=colour, label=label)
+    theme.plain_axes(ax, grid=False)
+    theme.label_axes(ax, "east [m]", "north [m]")
+    theme.legend_below(figure, 1)
+    path.write_bytes(theme.render_png(figure))
+
+
+def shrink(path: Path) -> None:
+    """Rewrite a picture at the width of the page, with a palette."""
+    image = Image.open(path).convert("RGB")
+    if image.width != WIDTH_PX:
+        resample = Image.Resampling.NEAREST if image.width < WIDTH_PX else Image.Resampling.LANCZOS
+        size = (WIDTH_PX, round(image.height * WIDTH_PX / image.width))
+        image = image.resize(size, resample)
+    image.quantize(COLOURS).save(path, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Write the galleries of the documentation.")
+    parser.add_argument("--pages", action="store_true", help="write the pages without pictures")
+    options = parser.parse_args()
+    PAGES.mkdir(exist_ok=True)
+    PICTURES.mkdir(exist_ok=True)
+    for name, (title, introduction, entries_of) in GALLERIES.items():
+        entries = entries_of()
+        replace_file(PAGES / f"{name}.md", page(title, introduction, entries).encode())
+        if not options.pages:
+            for entry in entries:
+                for file, draw in entry.pictures.items():
+                    print(file, flush=True)
+                    draw(PICTURES / file)
+    if not options.pages:
+        draw_gap(PICTURES.parent / "hardware-gap.png")
+
+
+if __name__ == "__main__":
+    main()
