@@ -2,7 +2,7 @@
 
 A page marks the generated parts:
 
-    <!-- results: gap-short -->
+    <!-- results: evidence -->
     ...
     <!-- end of results -->
 
