@@ -60,6 +60,11 @@ def _costs(gap: Gap) -> str:
     return ", ".join(f"{name} {number(figure, 0, '+')} %" for name, figure in figures.items())
 
 
+def _changes(gap: Gap) -> tuple[str, ...]:
+    figures = (gap.flight_time_s, gap.distance_m, gap.energy_j)
+    return (*(percent(each) for each in figures), f"{gap.flight_time_s.n}")
+
+
 @block("mitigation-runs", "gap")
 def mitigation_runs(records: Records) -> str:
     runs = _letters(records)
