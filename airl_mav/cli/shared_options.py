@@ -167,7 +167,7 @@ class ToldRun:
     """Number of finished flights."""
     quality: dict[str, Any]
     """Each statistic of `airl_mav.flight.statistics.Aggregate`: `value`, `low` and `high` of its 95
-    % interval, `n`; `outcomes` counts the flights by outcome."""
+    % interval, `n`; `outcomes` counts the valid flights by outcome."""
     sha256: str | None
     """Digest of all flights in lockstep; None at other levels and for incomplete runs."""
 

@@ -29,7 +29,7 @@ from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
-from airl_mav.report.document import count_outcomes
+from airl_mav.report.document import count_flights
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
@@ -231,7 +231,7 @@ def _fly_live(
 
 def outcome_line(run: campaign.CellRun) -> str:
     """Return the outcomes of a cell's flights as text."""
-    told = count_outcomes([episode.outcome for episode in run.episodes])
+    told = count_flights(run.episodes)
     return told if run.new else f"{told} (flown before)"
 
 

@@ -145,6 +145,9 @@ class Referee:
 BY_HAND = "latency or compensation was changed by hand"
 """Invalidity reason after a manual change in flight."""
 
+STRANGER = "commanded by a stranger"
+"""Invalidity reason if another client commanded the vehicle; its name follows."""
+
 LATE_FRAMES = 3.0
 """Delay limit in camera periods, for a frame's age at its decision, and for a decision's start
 after the previous hold time. With a fast host the delay is one period plus transport."""
@@ -250,7 +253,7 @@ def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[st
             continue
         if value < rule.limit if rule.least else value > rule.limit:
             faults.append(rule.text.format(rule.scale * value, rule.scale * rule.limit))
-    faults.extend(f"commanded by a stranger: {stranger}" for stranger in strangers)
+    faults.extend(f"{STRANGER}: {stranger}" for stranger in strangers)
     return tuple(faults)
 
 

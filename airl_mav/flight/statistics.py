@@ -185,11 +185,11 @@ def reached_goals(episodes: Sequence[EpisodeRecord]) -> list[bool]:
 
 def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     """Return a run's figures, over its valid episodes."""
+    flown = [episode for episode in episodes if not episode.invalid]
     outcomes = dict.fromkeys(Outcome, 0)
-    for episode in episodes:
+    for episode in flown:
         outcomes[episode.outcome] += 1
     reached = reached_goals(episodes)
-    flown = [episode for episode in episodes if not episode.invalid]
     good = successful(flown)
     qualities = [episode.quality for episode in flown if episode.quality is not None]
     return Aggregate(

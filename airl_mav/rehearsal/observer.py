@@ -18,6 +18,9 @@ from airl_mav.rehearsal.channel import State, Text
 WARNING = 4
 """MAV_SEVERITY_WARNING: shows texts of this severity or worse."""
 
+FLOWN_AGAIN = "flown again: "
+"""Start of a note about an attempt before the recorded one."""
+
 OUTCOME_STYLES = {
     Outcome.SUCCESS: "green",
     Outcome.COLLISION: "red",
@@ -114,11 +117,13 @@ class LiveObserver(Observer):
             figures += " "
         self._progress.note(
             f"  flight {record.index:03d}  seed {record.seed:<5} "
-            f"{record.outcome.value:<10}{figures}{record.reason}",
-            OUTCOME_STYLES[record.outcome],
+            f"{record.outcome.value:<10}{figures}{record.reason}"
+            f"{' (invalid)' if record.invalid else ''}",
+            "yellow" if record.invalid else OUTCOME_STYLES[record.outcome],
         )
         for note in record.notes:
-            self._progress.note(f"    {note}", "yellow")
+            if not note.startswith(FLOWN_AGAIN):  # `lost` has printed it.
+                self._progress.note(f"    {note}", "yellow")
         if record.sha256 is not None:
             self._progress.note(f"    sha256 {record.sha256['flight']}", "dim")
         self._tally.add(record)

@@ -25,7 +25,7 @@ from airl_mav.rehearsal.episode import (
     join_episode,
 )
 from airl_mav.rehearsal.live_view import ViewAddresses
-from airl_mav.rehearsal.observer import WARNING, Observer
+from airl_mav.rehearsal.observer import FLOWN_AGAIN, WARNING, Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.external.programs import load_timeout_s
@@ -84,7 +84,7 @@ class Rehearsal:
             except process_pair.LostError as error:
                 # The next attempt starts two new processes.
                 self._dismiss()
-                notes.append(f"flown again: {error.what}")
+                notes.append(f"{FLOWN_AGAIN}{error.what}")
                 if len(notes) == MAX_ATTEMPTS:
                     raise RehearsalError(
                         f"{flight}: lost {MAX_ATTEMPTS} times; at last {error}"
@@ -96,7 +96,7 @@ class Rehearsal:
             by_hand = BY_HAND in flown.record.invalid
             if not faults or by_hand or len(notes) + 1 == MAX_ATTEMPTS:
                 break
-            notes.append(f"flown again: invalid: {faults}")
+            notes.append(f"{FLOWN_AGAIN}invalid: {faults}")
             self._observer.lost(f"{flight} is invalid and begins again: {faults}")
         self._folder.save_episodes([flown])
         self._clear(index)

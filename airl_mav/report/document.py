@@ -26,6 +26,7 @@ from airl_mav.latency.stages import MIN_SAMPLES, Summary
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+    from airl_mav.flight.episode_record import EpisodeRecord
     from airl_mav.report.theme import FigureImage
 
 REPORT_FILE = "report.html"
@@ -415,13 +416,12 @@ def print_facts(rows: Iterable[tuple[str, str]], console: Console, *, style: str
     console.print(facts)
 
 
-def count_outcomes(outcomes: Sequence[Outcome]) -> str:
-    """Return the number of flights by outcome on one line."""
-    return ", ".join(
-        f"{outcomes.count(outcome):,} {label}"
-        for outcome, label in OUTCOME_LABELS.items()
-        if outcome in outcomes
-    )
+def count_flights(episodes: Sequence[EpisodeRecord]) -> str:
+    """Return the number of valid flights by outcome, and of invalid flights, on one line."""
+    valid = [episode.outcome for episode in episodes if not episode.invalid]
+    counts = [(valid.count(outcome), label) for outcome, label in OUTCOME_LABELS.items()]
+    counts.append((len(episodes) - len(valid), "flown but invalid"))
+    return ", ".join(f"{count:,} {label}" for count, label in counts if count)
 
 
 SCHEMA = 1

@@ -356,12 +356,10 @@ MAX_PRINTED = 25
 """Maximum number of flights listed in the terminal."""
 
 
-def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> None:
-    """Print the verdict, the setup and the tables."""
-    print_verdict(verdict.lines, console)
-    console.print()
+def print_report(run: LoadedRun, console: Console) -> None:
+    """Print the setup and the tables."""
     summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
-    flights = document.count_outcomes([episode.outcome for episode in run.episodes])
+    flights = document.count_flights(run.episodes)
     document.print_facts([*setup_rows(run), ("flights", flights)], console)
     for view in (
         latency_table(summary),
@@ -383,22 +381,37 @@ def show_report(
     progress: Progress | None = None,
     *,
     draw: bool = True,
+    tables: bool = True,
 ) -> Path | None:
-    """Print the report of a run, then draw its page or print the command that draws it."""
+    """Print a run's tables, then the place of its page (or the command for it), then the verdict.
+
+    Args:
+        run: Flights to report.
+        verdict: Verdict on the flights, saved as `verdict.json`.
+        console: Console for tables and verdict.
+        progress: Receiver of progress reports.
+        draw: True to draw the page.
+        tables: True to print the tables, which the page also contains.
+
+    Returns:
+        Path of the page; None = not drawn.
+    """
     progress = progress or Progress()
     if run.episodes:
         save_verdict(verdict, run.path)
-    print_report(run, console, verdict)
-    if not run.episodes:
-        return None
-    if not draw:
-        print_place("report", f"airl report {shlex.quote(str(run.path))}", console)
-        return None
-    # Imported here: pages need matplotlib, which takes longer to load than ten flights take.
-    from airl_mav.report.run_report import write_report
+    if tables:
+        print_report(run, console)
+    page: Path | None = None
+    if run.episodes and draw:
+        # Imported here: pages need matplotlib, which takes longer to load than ten flights take.
+        from airl_mav.report.run_report import write_report
 
-    progress.status(DRAWING)
-    page = write_report(run, verdict=verdict)
-    progress.status(None)
-    print_place("report", page, console)
+        progress.status(DRAWING)
+        page = write_report(run, verdict=verdict)
+        progress.status(None)
+    if run.episodes:
+        place = page or f"airl report {shlex.quote(str(run.path))}"
+        print_place("report", place, console)
+    console.print()
+    print_verdict(verdict.lines, console)
     return page

@@ -1,12 +1,13 @@
 """Verdict: setup, success rate, and each requirement as met, not met or undecided.
 
-The verdict is the first line of every output. CI reads it from `verdict.json`, JUnit XML or a
+The verdict is the last line of a run's output. CI reads it from `verdict.json`, JUnit XML or a
 badge.
 """
 
 from __future__ import annotations
 
 import math
+import shlex
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,10 +19,13 @@ from pydantic import TypeAdapter
 from airl_mav.core.errors import EXIT_INVALID, EXIT_NOT_MET, EXIT_UNDECIDED
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.flight.episode_record import EpisodeRecord, Setup
+from airl_mav.flight.judge import BY_HAND, STRANGER, Outcome
 from airl_mav.flight.requirements import Finding, Requirement, RequirementDecision, find
 from airl_mav.flight.statistics import Aggregate, Estimate, PairedComparison, aggregate
+from airl_mav.latency.injection import moments
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.document import environment
+from airl_mav.scenario.scenario_file import SCENARIO_FILE
 
 SCHEMA = 1
 """Schema version of `verdict.json`, described in docs/reference/run-folder.md."""
@@ -58,6 +62,8 @@ class OverallVerdict:
     invalid: tuple[str, ...] = ()
     """Invalid flights, one line each; any of them makes the verdict invalid."""
     findings: tuple[Finding, ...] = ()
+    advice: str = ""
+    """Proposal for flights that the host disturbed; empty = no proposal."""
     schema: int = SCHEMA
 
     @property
@@ -82,6 +88,7 @@ class OverallVerdict:
         """Lines of the verdict, most important first."""
         return (
             *(f"INVALID: {line}" for line in self.invalid),
+            *filter(None, (self.advice,)),
             *self.sentences,
             *(finding.sentence() for finding in self.findings),
         )
@@ -107,27 +114,37 @@ def judge_run(
 ) -> OverallVerdict:
     """Return the verdict of a run; raise FieldError for a required gap without a reference."""
     computer = Path(setup.computer.name).stem
-    rate = quality.success_rate
-    reached = "no flight was finished"
-    if rate.value is not None:
-        reached = (
-            f"{round(rate.value * rate.n):,} of {rate.n:,} goals reached,"
-            f" {_percent(rate.scaled(100.0))}"
-        )
+    rate, injection = quality.success_rate, setup.injection
+    machine = computer
+    if injection.latency is not None:
+        machine += f" with {moments(injection.latency)} of {injection.origin} latency"
     conditions = f" ({setup.conditions})" if setup.conditions else ""
     sentence = (
-        f"{setup.policy.name} on {computer} in {Path(setup.arena.name).stem}{conditions},"
-        f" level {setup.level}: {reached}"
+        f"{setup.policy.name} on {machine} in {Path(setup.arena.name).stem}{conditions},"
+        f" level {setup.level}: {_reached(rate, episodes)}"
     )
     if against is not None:
         sentence += _gap_words(against, reference)
-    share = "no flight" if rate.value is None else f"{100.0 * rate.value:.1f} %"
+    share = "no valid flight" if rate.value is None else f"{100.0 * rate.value:.1f} %"
     return OverallVerdict(
         sentences=(f"{sentence}.",),
-        short=f"{share} on {computer}",
+        short=f"{share} on {machine}",
         invalid=invalid_flights(episodes),
         findings=tuple(find(requirement, quality, against) for requirement in requirements),
     )
+
+
+def _reached(rate: Estimate, episodes: Sequence[EpisodeRecord]) -> str:
+    """Return the outcome of all flights as text."""
+    told = []
+    if rate.value is not None:
+        goals = f"{round(rate.value * rate.n):,} of {rate.n:,} goals reached"
+        told.append(f"{goals}, {_percent(rate.scaled(100.0))}")
+    if invalid := [episode for episode in episodes if episode.invalid]:
+        goals = sum(episode.outcome is Outcome.SUCCESS for episode in invalid)
+        flights = "flight" if len(invalid) == 1 else "flights"
+        told.append(f"{len(invalid):,} {flights} flown but invalid ({goals:,} reached the goal)")
+    return "; ".join(told) or "no flight was finished"
 
 
 def invalid_flights(episodes: Sequence[EpisodeRecord]) -> tuple[str, ...]:
@@ -252,5 +269,11 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     """Return a run's verdict; `requirements` default to the requirements of `verdict.json`."""
     if requirements is None:
         requirements = requirements_of(run.path)
-    verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
-    return replace(verdict, sentences=verdict.sentences + unchecked([run.info]))
+    setup, episodes = run.info.setup, run.episodes
+    verdict = judge_run(setup, aggregate(episodes), episodes, requirements)
+    reasons = [reason for episode in episodes for reason in episode.invalid]
+    advice = ""
+    if setup.level == "sitl" and any(not each.startswith((BY_HAND, STRANGER)) for each in reasons):
+        file = shlex.quote(str(run.path / SCENARIO_FILE))
+        advice = f"To fly without real time, run: airl-sitl {file} --level lockstep"
+    return replace(verdict, advice=advice, sentences=verdict.sentences + unchecked([run.info]))

@@ -35,7 +35,6 @@ from airl_mav.report.run_tables import (
     real_time_table,
     run_ages,
 )
-from airl_mav.report.run_verdict import verdict_of
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
 from tests.support.page_alone import page_alone, unpacked
@@ -437,7 +436,7 @@ def test_a_run_without_flights_still_has_a_page(tmp_path: Path) -> None:
     parsed = Page(build_page(run, {}).read_text(encoding="utf-8"))
     assert "no flight finished" in " ".join(parsed.words)
     assert parsed.images == []
-    print_report(run, Console(file=io.StringIO(), width=80), verdict_of(run))
+    print_report(run, Console(file=io.StringIO(), width=80))
 
 
 def test_pictures_go_to_the_flights_that_failed(
@@ -463,7 +462,7 @@ def test_the_terminal_shows_the_same_tables_in_80_columns(
     run, _ = demo
     printed = io.StringIO()
     console = Console(file=printed, width=80, color_system=None)
-    print_report(run, console, verdict_of(run))
+    print_report(run, console)
     text = printed.getvalue()
     assert "…" not in text.replace(" … ", "")
     summary = summarize_run(run)

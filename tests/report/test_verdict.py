@@ -6,15 +6,18 @@ import json
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from airl_mav.core.constants import Level
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup
-from airl_mav.flight.judge import Outcome
+from airl_mav.flight.judge import BY_HAND, STRANGER, Outcome
 from airl_mav.flight.requirements import parse_requirement
 from airl_mav.flight.statistics import aggregate, compare_pairs
 from airl_mav.flight.trajectory import Leg, Quality
-from airl_mav.latency.injection import NOTHING_INJECTED
+from airl_mav.latency.injection import NOTHING_INJECTED, parse_latency
+from airl_mav.report.document import count_flights
 from airl_mav.report.run_verdict import (
     OverallVerdict,
     judge_run,
@@ -23,6 +26,7 @@ from airl_mav.report.run_verdict import (
     write_badge,
     write_junit,
 )
+from airl_mav.report.run_verdict import verdict_of as judged
 
 SETUP = Setup(
     level="lockstep",
@@ -123,6 +127,57 @@ def test_invalid_flights_come_first_and_leave_no_verdict() -> None:
     verdict = judge_run(SETUP, aggregate(flown), flown, [parse_requirement("success >= 90 %")])
     assert verdict.lines[0] == "INVALID: flight 000, seed 40: 20 % given up"
     assert (verdict.status, verdict.exit_code) == ("invalid", 4)
+
+
+def test_flights_that_are_all_invalid_are_counted_as_flown() -> None:
+    flown = [replace(flight(i), invalid=("20 % given up",)) for i in range(3)]
+    verdict = judge_run(SETUP, aggregate(flown), flown)
+    assert verdict.sentences[0].endswith(
+        "level lockstep: 3 flights flown but invalid (3 reached the goal)."
+    )
+    assert verdict.short == "no valid flight on pi"
+    assert count_flights(flown) == "3 flown but invalid"
+    assert set(aggregate(flown).outcomes.values()) == {0}
+
+
+def test_invalid_flights_are_counted_beside_valid_ones() -> None:
+    flown = [flight(0), replace(flight(1, Outcome.COLLISION), invalid=("20 % given up",))]
+    verdict = judge_run(SETUP, aggregate(flown), flown)
+    assert verdict.sentences[0].endswith("1 flight flown but invalid (0 reached the goal).")
+    assert "1 of 1 goals reached, 100.0 % [" in verdict.sentences[0]
+    assert count_flights(flown) == "1 goal reached, 1 flown but invalid"
+
+
+def test_no_flight_is_said_of_no_flight() -> None:
+    assert judge_run(SETUP, aggregate([]), []).sentences[0].endswith("no flight was finished.")
+
+
+def test_the_sentence_contains_the_injected_latency() -> None:
+    flown = flights(3, 0)
+    setup = replace(SETUP, injection=parse_latency("lognormal:60ms,10ms"))
+    verdict = judge_run(setup, aggregate(flown), flown)
+    assert verdict.sentences[0].startswith("mine on pi with 60 ± 10 ms of injected latency in ")
+    assert verdict.short == "100.0 % on pi with 60 ± 10 ms of injected latency"
+
+
+@pytest.mark.parametrize(
+    ("level", "reason", "proposes"),
+    [
+        ("sitl", "20 % given up", True),
+        ("lockstep", "20 % given up", False),
+        ("sitl", BY_HAND, False),
+        ("sitl", f"{STRANGER}: system 9", False),
+    ],
+)
+def test_lockstep_is_proposed_once_where_the_host_disturbed_flights(
+    level: Level, reason: str, proposes: bool
+) -> None:
+    flown = [replace(flight(i), invalid=(reason,)) for i in range(2)]
+    info = SimpleNamespace(setup=replace(SETUP, level=level), config={})
+    run = SimpleNamespace(info=info, episodes=flown, path=Path("runs/my run"))
+    lines = judged(run, ()).lines  # type: ignore[arg-type]
+    command = "airl-sitl 'runs/my run/scenario.toml' --level lockstep"
+    assert [command in line for line in lines] == [False, False, *[True] * proposes, False]
 
 
 def test_an_abort_is_a_failure_and_drops_out_of_nothing() -> None:
