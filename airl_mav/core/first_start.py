@@ -31,6 +31,8 @@ from airl_mav.core.progress import Bar, Progress
 
 LABEL = "compiling kernels (first start only)"
 
+LOADING = "loading kernels (the first start compiles them, in about a minute on two idle cores)"
+
 POLL_S = 0.1
 """Interval between two checks for Ctrl-C [wall s]."""
 
@@ -178,7 +180,9 @@ def _locked(folder: Path, progress: Progress, stop: Callable[[], bool]) -> Itera
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 if not said:
-                    progress.status("waiting for another program that compiles kernels")
+                    what = "waiting for another program that compiles kernels"
+                    progress.status(what)
+                    progress.line(what)
                 said = True
                 clock.sleep_until(clock.time_us() + round(POLL_S * US_PER_S))
             except OSError:
@@ -230,9 +234,12 @@ class _Step:
     def run(self, parts: Sequence[CompileJob], whole: CompileJob) -> list[str] | None:
         """Run all jobs; return the source files of the kernels, or None if a job failed."""
         self._total = sum(job.kernels for job in (*parts, whole))
+        self._progress.status(LOADING)
+        self._progress.line(LOADING)
         try:
             done = self._run_all(parts) and self._run_all([whole])
         finally:
+            self._progress.status(None)
             for each in self._running:
                 each.process.kill()  # numba replaces files atomically.
                 _clear(each)

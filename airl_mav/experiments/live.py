@@ -126,6 +126,7 @@ def _watched(
     with closing(started) as viewer:
         progress.note(f"view       {viewer.url}")
         with closing(view_part("observer")(viewer.ends, onwards)) as observer:
+            observer.waiting("starting")
             yield viewer.ends, observer
 
 

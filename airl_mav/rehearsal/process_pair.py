@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import shutil
 import sys
@@ -18,6 +19,7 @@ from airl_mav.core.child_process import GRACE_S, ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.core.machine import usable_cores
 from airl_mav.faults import Fault
 from airl_mav.rehearsal.channel import Begin, Compiling, Due, Event, Failed, Ready, parse_event
 
@@ -30,7 +32,7 @@ MODULES = {
 """Python module of each process."""
 
 READY_TIMEOUT_S = 180.0
-"""Maximum time until both are ready, without kernel compilation [wall s]."""
+"""Maximum time until both are ready, without kernel compilation, on an idle host [wall s]."""
 
 REPLY_TIMEOUT_S = 30.0
 """Reply timeout of a healthy process [wall s]."""
@@ -140,7 +142,9 @@ class ProcessPair:
                     compiling()
             return len(ready) == len(self._children)
 
-        self.pump(note, READY_TIMEOUT_S, "both processes to be ready", lambda: bool(compiles))
+        busy = max(1.0, os.getloadavg()[0] / usable_cores())
+        limit_s = READY_TIMEOUT_S * busy
+        self.pump(note, limit_s, "both processes to be ready", lambda: bool(compiles))
 
     def stop(self) -> None:
         """End both processes and wait for their exit."""

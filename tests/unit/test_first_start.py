@@ -14,6 +14,7 @@ from rich.console import Console
 from airl_mav.core import kernels
 from airl_mav.core.first_start import (
     LABEL,
+    LOADING,
     CompileJob,
     CompilePlan,
     compile_first,
@@ -89,7 +90,8 @@ def until(cache: Path, name: str) -> Iterator[bool]:
 @pytest.mark.nightly
 def test_a_step_is_shown_and_the_next_start_prints_nothing(cache: Path) -> None:
     first = shown().splitlines()
-    assert first[0] == f"{LABEL}: 0 of 3, {first[0].rpartition(', ')[2]}"
+    assert first[0] == LOADING
+    assert first[1] == f"{LABEL}: 0 of 3, {first[1].rpartition(', ')[2]}"
     assert first[-1].startswith("kernels compiled in ")
     assert compiled(cache) == {"small.left", "small.right", "small.both"}
     before = {file: file.stat().st_mtime_ns for file in cache.rglob("*")}
@@ -118,11 +120,11 @@ def test_an_interrupted_step_resumes(cache: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_a_changed_source_is_compiled_again_and_a_full_cache_is_silent(cache: Path) -> None:
+def test_a_changed_source_is_compiled_again_and_a_full_cache_is_loaded(cache: Path) -> None:
     shown()
     (record,) = cache.glob("*.json")
     record.unlink()
-    assert shown() == ""  # Everything is found in the cache.
+    assert shown() == f"{LOADING}\n"  # Everything is found in the cache.
     files = json.loads(record.read_bytes())["files"]
     source = Path("small.py").resolve()
     assert str(source) in files

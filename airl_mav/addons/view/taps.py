@@ -245,7 +245,8 @@ class ViewObserver(Observer):
         self.shows_states = onwards.shows_states
 
     def waiting(self, what: str) -> None:
-        """Forward the reason of a wait."""
+        """Report the reason of a wait, such as the start of the processes, as the phase."""
+        self._feed.send(PhaseStart(time_us=0, phase=what))
         self._onwards.waiting(what)
 
     def episode(self, index: int, seed: int, goal: Goal) -> None:
