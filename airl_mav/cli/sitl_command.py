@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -15,8 +17,11 @@ from airl_mav.cli import shared_options
 from airl_mav.cli.options import check_installed, run_command, scenario_of
 from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
+from airl_mav.core.errors import UsageError
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.projections import SLOW
+from airl_mav.rehearsal.host_pace import host_problem
+from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.external.programs import how_to_start
@@ -51,6 +56,10 @@ class SitlOptions(shared_options.Gate, shared_options.Viewing, shared_options.Te
         " QGroundControl on this machine listens",
     )
 
+    tables: bool = Field(
+        default=False, description="print the tables of the report before the verdict"
+    )
+
 
 OPTIONS = SitlOptions
 
@@ -60,9 +69,11 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
     voice = shared_options.Voice(options, "airl-sitl", console)
     requirements = shared_options.requirements_of(options, reference=False)
     view = shared_options.view_of(options)
-    scenario = resolve(scenario_of(options))
+    scenario, warning = on_this_host(resolve(scenario_of(options)), options, voice)
     film = video_of(options, scenario.scenario, partial(_say, voice.console))
     with voice, film:
+        if warning:
+            voice.progress.note(warning, "yellow")
         flown = fly_live(
             scenario,
             options.out,
@@ -72,6 +83,44 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         )
         judged = conclude(flown, options, requirements, voice)
     return EXIT_CODES[flown.ended] or judged
+
+
+def on_this_host(
+    scenario: ResolvedScenario, options: SitlOptions, voice: shared_options.Voice
+) -> tuple[ResolvedScenario, str]:
+    """Return the scenario to fly, and a warning if this host does not keep real time.
+
+    A user at a terminal may choose level lockstep instead. Otherwise the flights begin after the
+    warning.
+    """
+    asked = scenario.scenario
+    if asked.level != "sitl" or not asked.validity:
+        return scenario, ""
+    if not (problem := host_problem(scenario.speed or 1.0)):
+        return scenario, ""
+    warning = f"warning: flights may be invalid, as this host does not keep real time: {problem}"
+    try:
+        lockstep = resolve(scenario_of(options, level="lockstep"))
+    except UsageError:
+        return scenario, warning
+    known = options.out is not None and (options.out / RUN_FILE).exists()
+    silent = options.quiet or options.json_lines
+    if known or silent or not (sys.stdin.isatty() and voice.console.is_terminal):
+        return scenario, f"{warning}. Without real time: {lockstep_command(sys.argv[1:])}"
+    _say(voice.console, warning)
+    question = "Fly at level lockstep instead: the same tables, without real time? [Y/n] "
+    return (scenario if voice.console.input(question).lower().startswith("n") else lockstep), ""
+
+
+def lockstep_command(words: Sequence[str]) -> str:
+    """Return the command line for the same flights at level lockstep, in a new run folder."""
+    kept: list[str] = []
+    skips = False
+    for word in words[1:] if words[:1] == ["sitl"] else words:
+        if not skips and word != "--out" and not word.startswith("--out="):
+            kept.append(word)
+        skips = word == "--out"
+    return shlex.join(["airl-sitl", *kept, "--level", "lockstep"])
 
 
 def video_of(
@@ -88,11 +137,11 @@ def video_of(
 
 def conclude(
     flown: FlownRun,
-    gate: shared_options.Gate,
+    options: SitlOptions,
     requirements: Sequence[Requirement],
     voice: shared_options.Voice,
 ) -> int:
-    """Print the tables and write the report of the flights; return the verdict's exit status."""
+    """Write the report of the flights and print the verdict; return the verdict's exit status."""
     if not flown.episodes:
         _say(voice.console, f"no episode was finished; logs in {flown.path}")
         voice.finish(EXIT_CODES[flown.ended], flown.ended, flown.path)
@@ -105,8 +154,8 @@ def conclude(
     run = load(flown.path)
     verdict = verdict_of(run, requirements)
     if flown.ended == "complete":
-        shared_options.leave(gate, verdict, "airl-sitl")
-    page = show_report(run, verdict, voice.console, voice.progress)
+        shared_options.leave(options, verdict, "airl-sitl")
+    page = show_report(run, verdict, voice.console, voice.progress, tables=options.tables)
     voice.finish(
         EXIT_CODES[flown.ended] or verdict.exit_code,
         flown.ended,

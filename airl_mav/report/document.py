@@ -229,7 +229,7 @@ def markdown(document: Document) -> str:
 def print_verdict(lines: Sequence[str], console: Console) -> None:
     """Print the lines of a verdict in bold."""
     for line in lines:
-        console.print(Text(line, style="bold"))
+        console.print(Text(line, style="bold"), soft_wrap=True)
 
 
 def print_document(document: Document, console: Console) -> None:
