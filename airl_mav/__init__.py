@@ -21,29 +21,29 @@ _EXPORTS = {
     "ExperimentResult": "airl_mav.experiments.experiment",
     "Run": "airl_mav.experiments.experiment",
     "Scenario": "airl_mav.scenario.model",
-    "degrade": "airl_mav.experiments.evaluate",
+    "latency_sweep": "airl_mav.experiments.evaluate",
     "evaluate": "airl_mav.experiments.evaluate",
-    "gap": "airl_mav.experiments.gap",
-    "ladder": "airl_mav.experiments.evaluate",
+    "hardware_gap": "airl_mav.experiments.hardware_gap",
+    "compare_levels": "airl_mav.experiments.evaluate",
     "load_run": "airl_mav.experiments.experiment",
     "rehearse": "airl_mav.experiments.experiment",
 }
 """Public names, and the modules that define them."""
 
 if TYPE_CHECKING:
-    from airl_mav.experiments.evaluate import degrade, evaluate, ladder
+    from airl_mav.experiments.evaluate import compare_levels, evaluate, latency_sweep
     from airl_mav.experiments.experiment import ExperimentResult, Run, load_run, rehearse
-    from airl_mav.experiments.gap import gap
+    from airl_mav.experiments.hardware_gap import hardware_gap
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
     "ExperimentResult",
     "Run",
     "Scenario",
-    "degrade",
+    "compare_levels",
     "evaluate",
-    "gap",
-    "ladder",
+    "hardware_gap",
+    "latency_sweep",
     "load_run",
     "rehearse",
 ]

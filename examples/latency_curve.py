@@ -1,8 +1,8 @@
 """The latency curve of a policy: the same seeds at growing latencies, in the batch twin."""
 
-from airl_mav import Scenario, degrade
+from airl_mav import Scenario, latency_sweep
 
-curve = degrade(Scenario(level="gym", episodes=50), latencies=("native", "200ms", "400ms"))
+curve = latency_sweep(Scenario(level="gym", episodes=50), latencies=("native", "200ms", "400ms"))
 
 print("latency   success   flight time   distance")
 for run in curve.comparison.runs:

@@ -3,7 +3,7 @@
     python scripts/fuzz_recordings.py --seconds 600
 
 A vehicle's log, a black box and a run folder, flown once at the start, and meshes in every format
-are damaged in their bytes, most often in the headers near the beginning. `airl refit`, `airl
+are damaged in their bytes, most often in the headers near the beginning. `airl identify`, `airl
 report`, `airl export-log` and `airl asset` must accept each, or reject it with one line. The test
 stops at the first other result, keeps the file, and prints the case, which `--what WHAT --first
 NUMBER` repeats.
@@ -130,12 +130,12 @@ def _damaged_copy(rng: np.random.Generator, source: Path, folder: Path) -> Path:
 
 def _log(rng: np.random.Generator, folder: Path) -> tuple[str, list[str]]:
     log = _damaged_copy(rng, _flown()[1], folder)
-    return "refit", [str(log), "--vehicle", "quad", "--out", str(folder / "out")]
+    return "identify", [str(log), "--vehicle", "quad", "--out", str(folder / "out")]
 
 
 def _black_box(rng: np.random.Generator, folder: Path) -> tuple[str, list[str]]:
     box = _damaged_copy(rng, _flown()[0], folder)
-    command = ("refit", "report", "export_log")[int(rng.integers(3))]
+    command = ("identify", "report", "export_log")[int(rng.integers(3))]
     return command, [str(box), *(() if command == "report" else ("--out", str(folder / "out")))]
 
 

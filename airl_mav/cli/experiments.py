@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 NOTHING_REQUIRED = Gate()
 FOR_PEOPLE = Telling()
 
-COMMANDS = {"matrix": "airl evaluate", "degradation": "airl degrade"}
+COMMANDS = {"matrix": "airl evaluate"}
 """Kinds of comparisons whose command has another name."""
 
 

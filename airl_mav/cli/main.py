@@ -25,10 +25,10 @@ SUBCOMMANDS: dict[str, str] = {
     "companion": "what runs on the drone's onboard computer (airl-companion)",
     "evaluate": "fly policies through seeded episodes, with intervals",
     "verdict": "does a policy hold on an onboard computer: as few flights as that takes",
-    "gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
+    "hardware-gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
     " mitigation",
-    "degrade": "the same policy at growing latencies: where it breaks down",
-    "ladder": "the same policy and seeds at several levels of the fidelity ladder",
+    "latency-sweep": "the same policy at growing latencies: where it breaks down",
+    "compare-levels": "the same policy and seeds at several levels of the fidelity levels",
     "train": "train a policy on the batch twin",
     "export": "turn a stable-baselines3 model into a policy folder",
     "report": "a run's tables and page again, or a comparison of several runs",
@@ -43,7 +43,8 @@ SUBCOMMANDS: dict[str, str] = {
 def subcommands() -> dict[str, tuple[str, str]]:
     """Return all subcommands, add-ons last: purpose and module by name."""
     core = {
-        name: (purpose, f"airl_mav.cli.{name}_command") for name, purpose in SUBCOMMANDS.items()
+        name: (purpose, f"airl_mav.cli.{name.replace('-', '_')}_command")
+        for name, purpose in SUBCOMMANDS.items()
     }
     return core | entries("airl_mav", "COMMANDS")
 

@@ -292,7 +292,7 @@ EXTRAS = {
     "jpeg": ("PIL",),
     "mesh": ("trimesh",),
     "profile": ("onnx",),
-    "refit": ("mcap", "pyulog"),
+    "identify": ("mcap", "pyulog"),
     "render": ("mitsuba",),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "PIL", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),

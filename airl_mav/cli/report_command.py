@@ -21,7 +21,7 @@ from airl_mav.report.run_arenas import trust_arenas
 
 
 class ReportOptions(ProfileModel):
-    """Print the tables of a run, a gap or a ladder and rewrite its page; or compare runs.
+    """Print the tables of a run or a comparison and rewrite its page; or compare runs.
 
     Two or more runs are compared: settings, quality of flight with intervals, paired differences on
     shared seeds, latencies, paths, energy. The first run is the reference.
@@ -35,8 +35,7 @@ class ReportOptions(ProfileModel):
 
     runs: Annotated[tuple[Path, ...], POSITIONAL] = Field(
         default=(),
-        description="run folders, black boxes of flights (.mcap), or the folder of a gap, a ladder,"
-        " a curve or a table",
+        description="run folders, black boxes of flights (.mcap), or the folder of one comparison",
     )
     names: tuple[str, ...] = Field(
         default=(),

@@ -63,7 +63,7 @@ def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement,
             raise FieldError(
                 "require",
                 str(requirement),
-                f"a gap only where a reference is flown, as by airl gap; {ACCEPTED}",
+                f"a gap only where a reference is flown, as by airl hardware-gap; {ACCEPTED}",
             )
     return requirements
 
@@ -113,7 +113,7 @@ def folder_of(path: Path, ulg: Path | None = None) -> Path:
     """Return a run's folder, created from a black box and log if necessary, or UsageError."""
     if path.suffix != SUFFIX or path.is_dir():
         return path
-    check_installed("black-box" if ulg is None else "refit")
+    check_installed("black-box" if ulg is None else "identify")
     converter = entries("airl_mav", "RECORDINGS").get(path.suffix)
     if converter is None:
         raise UsageError(f"{path}: needs the add-on recordings (airl_mav/addons/recordings)")

@@ -63,7 +63,7 @@ TAKEOFF_REACHED_M_S: Final = 0.3
 MAX_ATTEMPTS: Final = 3
 """Maximum number of attempts for a job or a flight that loses its processes."""
 Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]
-"""Rung of the fidelity ladder, as named in reports."""
+"""Fidelity level, as named in reports."""
 CommandKind = Literal["velocity", "attitude", "body_rates"]
 """Type of a policy's commands, equal for all of its actions."""
 UNMEASURED_A: Final = -1.0

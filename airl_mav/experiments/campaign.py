@@ -454,7 +454,7 @@ class Declaration:
     """Contents of a campaign."""
 
     kind: str
-    """Kind of experiment: gap, ladder, sweep, ..."""
+    """Kind of experiment: hardware-gap, compare-levels, sweep, ..."""
     settings: dict[str, Any]
     cells: dict[str, DeclaredCell]
     """Cells by name, which is the name of the cell's folder."""

@@ -1,4 +1,4 @@
-"""Evaluations (policies by arenas), latency curves, and the fidelity ladder."""
+"""Evaluations (policies by arenas), latency curves, and comparisons of levels."""
 
 from __future__ import annotations
 
@@ -163,10 +163,10 @@ NATIVE = "native"
 
 LATENCIES = (NATIVE, "150ms", "300ms", "400ms", "950ms")
 
-DEGRADATION_FACTS = ("arena", "level", "vehicle", "episodes", "seed")
+LATENCY_SWEEP_FACTS = ("arena", "level", "vehicle", "episodes", "seed")
 
 
-def degrade(
+def latency_sweep(
     scenario: Scenario,
     latencies: Sequence[str] = LATENCIES,
     policies: Sequence[str] = (),
@@ -182,21 +182,21 @@ def degrade(
         latencies: Sources of t2, increasing, the reference first; `native` = none injected.
         policies: Names or folders; empty = the scenario's policy.
         compensated: Also fly each policy with latency compensation.
-        out: Folder to create or resume; None = `runs/<UTC time>-degradation-...`.
+        out: Folder to create or resume; None = `runs/<UTC time>-latency-sweep-...`.
         progress: Draw progress bars on standard error.
     """
-    declared = declare_degradation(scenario, latencies, policies, compensated=compensated)
+    declared = declare_latency_sweep(scenario, latencies, policies, compensated=compensated)
     return experiment.run_and_compare(declared, out, progress=progress)
 
 
-def declare_degradation(
+def declare_latency_sweep(
     scenario: Scenario,
     latencies: Sequence[str] = LATENCIES,
     policies: Sequence[str] = (),
     *,
     compensated: bool = False,
 ) -> experiment.Experiment:
-    """Declare a latency curve; see `degrade`. Raises UsageError."""
+    """Declare a latency curve; see `latency_sweep`. Raises UsageError."""
     if len(latencies) < 2 or len(set(latencies)) < len(latencies):
         raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
     names = list(policies) or [scenario.policy]
@@ -219,9 +219,9 @@ def declare_degradation(
                     group=policy,
                 )
             )
-    facts = {field: getattr(scenario, field) for field in DEGRADATION_FACTS}
+    facts = {field: getattr(scenario, field) for field in LATENCY_SWEEP_FACTS}
     return experiment.Experiment(
-        kind="degradation",
+        kind="latency-sweep",
         name="-".join(found),
         facts={"policies": found, **facts},
         cells=tuple(cells),
@@ -233,11 +233,11 @@ LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
 SITL_EPISODES = 10
 """Default number of episodes at level sitl, which runs in real time."""
 
-LADDER_FACTS = ("arena", "vehicle", "computer", "workload", "latency", "seed")
-"""Fields in the header of a ladder, besides the policy."""
+LEVELS_FACTS = ("arena", "vehicle", "computer", "workload", "latency", "seed")
+"""Fields in the header of a comparison of levels, besides the policy."""
 
 
-def ladder(
+def compare_levels(
     scenario: Scenario,
     levels: Sequence[LevelName] = LEVELS,
     *,
@@ -251,20 +251,20 @@ def ladder(
         scenario: The scenario; its level is ignored.
         levels: Two or more levels, the reference first.
         sitl_episodes: Episodes at level sitl; None = 10, or all if fewer.
-        out: Folder to create or resume; None = `runs/<UTC time>-ladder-...`.
+        out: Folder to create or resume; None = `runs/<UTC time>-compare-levels-...`.
         progress: Draw progress bars on standard error.
     """
-    declared = declare_ladder(scenario, levels, sitl_episodes=sitl_episodes)
+    declared = declare_compare_levels(scenario, levels, sitl_episodes=sitl_episodes)
     return experiment.run_and_compare(declared, out, progress=progress)
 
 
-def declare_ladder(
+def declare_compare_levels(
     scenario: Scenario,
     levels: Sequence[LevelName] = LEVELS,
     *,
     sitl_episodes: int | None = None,
 ) -> experiment.Experiment:
-    """Declare a ladder; see `ladder`. Raises UsageError."""
+    """Declare a comparison of levels; see `compare_levels`. Raises UsageError."""
     if len(set(levels)) < len(levels) or len(levels) < 2:
         raise FieldError(
             "levels", " ".join(levels) or "none", "two or more of gym lockstep sitl, each once"
@@ -277,10 +277,13 @@ def declare_ladder(
         for level in levels
     )
     policy, arena = cells[0].scenario.policy, cells[0].scenario.arena_name
-    facts = {"policy": policy.name, **{field: getattr(scenario, field) for field in LADDER_FACTS}}
+    facts = {
+        "policy": policy.name,
+        **{field: getattr(scenario, field) for field in LEVELS_FACTS},
+    }
     facts["rules"] = "; ".join(dict.fromkeys(cell.scenario.rules for cell in cells))
     return experiment.Experiment(
-        kind="ladder",
+        kind="compare-levels",
         name=f"{policy.name}-{arena}",
         facts=facts,
         cells=cells,

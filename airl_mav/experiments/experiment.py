@@ -1,4 +1,4 @@
-"""Experiments: named scenarios of `evaluate`, `gap`, `ladder` or `degrade`, flown and compared.
+"""Experiments: named scenarios, flown and compared.
 
 `Run` is the Python API of a run: fly a scenario; read episodes, quality, latencies, paths, report.
 """

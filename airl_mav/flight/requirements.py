@@ -163,7 +163,9 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
     if requirement.gap:
         if against is None:
             raise FieldError(
-                "require", str(requirement), "a gap only where a reference is flown: airl gap"
+                "require",
+                str(requirement),
+                "a gap only with a reference: airl hardware-gap",
             )
         # Both in percent, or in percentage points.
         estimate: Estimate = getattr(against, measure.attribute).difference

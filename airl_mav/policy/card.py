@@ -68,7 +68,7 @@ class MeasuredResult(ProfileModel):
     """Measured quality over a set of episodes; means over the successful ones."""
 
     arena: str = Field(description="arena profile")
-    level: Level = Field(description="rung of the fidelity ladder")
+    level: Level = Field(description="fidelity level")
     latency: str | None = optional(
         "source of t2 as --latency takes it; none: as fast as a desktop computer"
     )

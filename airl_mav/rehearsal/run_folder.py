@@ -53,8 +53,7 @@ FOLDER_KINDS = {
     RUN_FILE: "a single run",
     CAMPAIGN_FILE: "a campaign",
     "train.json": "a training",
-    "gap.json": "a verdict, or a gap of an earlier version",
-    **dict.fromkeys(("ladder.json", "matrix.json"), "runs of an earlier version"),
+    "hardware-gap.json": "a verdict",
 }
 """Folder contents, by the first of these files in it."""
 

@@ -298,7 +298,7 @@ class Flights(Workers):
 
     level: LevelName = Field(
         default="sitl",
-        description="rung of the fidelity ladder. gym: the batch twin, some hundred episodes a"
+        description="fidelity level. gym: the vectorized simulator, some hundred episodes a"
         " second. lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the"
         " same flight every time, bit by bit. sitl: two processes over UDP, in real time times the"
         " speed",

@@ -20,10 +20,10 @@ from published.record import RESULTS
 DECLARED_FILE = RESULTS / "results.toml"
 
 Kind = Literal[
-    "gap",
+    "hardware-gap",
     "matrix",
-    "ladder",
-    "degradation",
+    "compare-levels",
+    "latency-sweep",
     "compare",
     "run",
     "faults",

@@ -10,14 +10,14 @@ from published.text import NONE, both, interval_cell, number, percent, rate, tab
 
 
 _COMPARED = {
-    "ladder-fast": "`static-obstacles-fast`",
-    "ladder": "`static-obstacles`",
-    "ladder-one-arena": "`static-obstacles`, arena seed 431 alone",
-    "ladder-wind": "`static-obstacles`, wind",
-    "ladder-spread": "`static-obstacles`, domain randomization, noisy depth",
-    "ladder-dense": "`static-obstacles`, all of these in `dense-obstacles`",
-    "ladder-empty": "`crowded` in `no-obstacles`",
-    "ladder-crowded": "`crowded`, moving obstacles",
+    "levels-fast": "`static-obstacles-fast`",
+    "levels": "`static-obstacles`",
+    "levels-one-arena": "`static-obstacles`, arena seed 431 alone",
+    "levels-wind": "`static-obstacles`, wind",
+    "levels-spread": "`static-obstacles`, domain randomization, noisy depth",
+    "levels-dense": "`static-obstacles`, all of these in `dense-obstacles`",
+    "levels-empty": "`crowded` in `no-obstacles`",
+    "levels-crowded": "`crowded`, moving obstacles",
 }
 """Results that compare gym and lockstep, with their titles."""
 
@@ -44,17 +44,17 @@ def levels(records: Records) -> str:
     return table(("policy and conditions", *heads, *changed), rows, 8)
 
 
-@block("ladder-fast", "ladder-fast")
-def ladder_fast(records: Records) -> str:
-    return _levels(records["ladder-fast"])
+@block("levels-fast", "levels-fast")
+def levels_fast(records: Records) -> str:
+    return _levels(records["levels-fast"])
 
 
-@block("ladder-late", "ladder-late", "ladder-mitigated")
-def ladder_late(records: Records) -> str:
+@block("levels-late", "levels-late", "levels-mitigated")
+def levels_late(records: Records) -> str:
     rows = []
     for title, name in (
-        ("`static-obstacles`", "ladder-late"),
-        ("mitigated policy", "ladder-mitigated"),
+        ("`static-obstacles`", "levels-late"),
+        ("mitigated policy", "levels-mitigated"),
     ):
         (gap,) = records[name].gaps.values()
         cells = (both(getattr(gap, measure), 1, "+") for measure in MEASURES)

@@ -18,7 +18,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "static-obstacles-any-latency": ("any-latency", "static-obstacles-any-latency-1ms"),
     "static-obstacles-d435": ("static-obstacles-d435", "run"),
     "static-obstacles-rgb-fast": ("static-obstacles-rgb-fast", "run"),
-    "static-obstacles-ras-pi-4": ("gap", "static-obstacles-mitigated"),
+    "static-obstacles-ras-pi-4": ("hardware-gap", "static-obstacles-mitigated"),
     "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
     "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
     "dynamic-obstacles-fast": ("dynamic-obstacles-fast", "run"),
@@ -30,8 +30,8 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "crowded-fast": ("crowded-fast", "run"),
     "crowded-panorama": ("crowded-panorama", "run"),
     "gates": ("gates", "run"),
-    "body-rates": ("body-rates-gap", "no-obstacles-reference"),
-    "body-rates-120ms": ("body-rates-gap", "no-obstacles-mitigated"),
+    "body-rates": ("body-rates-hardware-gap", "no-obstacles-reference"),
+    "body-rates-120ms": ("body-rates-hardware-gap", "no-obstacles-mitigated"),
     "body-rates-hall": ("body-rates-hall", "run"),
 }
 """Results of each policy in its training arena, at its training latency."""

@@ -45,7 +45,7 @@ class OneGoal(ProfileModel):
 
 class StudyConfig(Scenario):
     description: str = Field(default="", description="one line for people")
-    level: LevelName = Field(default="gym", description="rung of the fidelity ladder")
+    level: LevelName = Field(default="gym", description="fidelity level")
     episodes: int = quantity("episodes of each run", "1", ge=1, le=100_000, default=1000)
     quick: dict[str, Any] = Field(default={"episodes": 40}, description="changes by --quick")
 

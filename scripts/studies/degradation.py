@@ -17,7 +17,7 @@ from rich.console import Console
 
 from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.progress import new_console
-from airl_mav.experiments.evaluate import LATENCIES, declare_degradation
+from airl_mav.experiments.evaluate import LATENCIES, declare_latency_sweep
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.scenario.model import Scenario
 
@@ -34,7 +34,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
     with study(options, DegradationConfig, __file__) as (config, root):
 
         def declare(scenario: Scenario) -> Experiment:
-            return declare_degradation(scenario, config.latencies, config.policies)
+            return declare_latency_sweep(scenario, config.latencies, config.policies)
 
         return fly(declare, scenario_of(config), config.one_goal, root, console or new_console())
 

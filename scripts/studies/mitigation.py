@@ -20,7 +20,7 @@ from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.fields import quantity
 from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment
-from airl_mav.experiments.gap import DEFAULT_MITIGATED, declare_gap
+from airl_mav.experiments.hardware_gap import DEFAULT_MITIGATED, declare_hardware_gap
 from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
@@ -45,7 +45,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
         )
 
         def declare(scenario: Scenario) -> Experiment:
-            return declare_gap(scenario, mitigated=mitigated, reference=config.reference)
+            return declare_hardware_gap(scenario, mitigated=mitigated, reference=config.reference)
 
         return fly(declare, scenario_of(config, policy=policy), config.one_goal, root, console)
 

@@ -22,7 +22,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment
-from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
+from airl_mav.experiments.hardware_gap import NOT_MITIGATED, declare_hardware_gap
 from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
@@ -45,7 +45,7 @@ class SystemConfig(StudyConfig):
 def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
     """Declare the hardware gap of every arena as one experiment."""
     gaps = [
-        declare_gap(
+        declare_hardware_gap(
             # The paper does not compensate latency.
             scenario.model_copy(update=each.model_dump() | {"compensate": False}),
             mitigated=NOT_MITIGATED,
@@ -59,7 +59,7 @@ def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
     own = ("policy", "workload")
     facts = gaps[0].facts | {f: ", ".join(f"{gap.facts[f]}" for gap in gaps) for f in own}
     facts["reference_workload"] = facts["workload"]
-    return Experiment("gap", "system", facts, cells)
+    return Experiment("hardware-gap", "system", facts, cells)
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:

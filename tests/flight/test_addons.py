@@ -126,7 +126,7 @@ def test_the_documentation_lists_all_addons() -> None:
 
 
 def test_there_are_addons() -> None:
-    assert "airl_mav.addons.refit" in ADDONS
+    assert "airl_mav.addons.identification" in ADDONS
 
 
 def test_the_core_flies_without_addons(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import airl_mav
-from airl_mav import Run, Scenario, degrade, evaluate, load_run, rehearse
+from airl_mav import Run, Scenario, evaluate, latency_sweep, load_run, rehearse
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.campaign import EpisodeSaver
 from airl_mav.flight.trajectory import Trajectory
@@ -244,14 +244,16 @@ def test_the_latency_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         out=out,
     )
     with page_alone():
-        code, text = airl("degrade", "greedy", *words)
+        code, text = airl("latency-sweep", "greedy", *words)
     assert code == 0
-    for name in ("degradation.json", "degradation.html", "degradation.md"):
+    for name in ("latency-sweep.json", "latency-sweep.html", "latency-sweep.md"):
         assert (out / name).stat().st_size > 1000
-    assert str(out / "degradation.html") in text
+    assert str(out / "latency-sweep.html") in text
     # Python returns the same figures without new flights; a longer curve resumes.
     monkeypatch.setattr(show, "write_document", lambda _, folder: folder / "none.html")
-    found = degrade(asked(episodes=3), ("native", "150ms", "400ms", "950ms"), ("greedy",), out=out)
+    found = latency_sweep(
+        asked(episodes=3), ("native", "150ms", "400ms", "950ms"), ("greedy",), out=out
+    )
     assert list(found.runs) == [f"greedy-{name}" for name in ("native", "150ms", "400ms", "950ms")]
     means = [run.latency["t2"].mean() / 1e3 for run in found.runs.values()]
     assert means == pytest.approx([1.0, 150.0, 400.0, 950.0], abs=1.0)
@@ -276,5 +278,5 @@ def test_a_curve_that_cannot_be_flown(words: tuple[str, ...], message: str, tmp_
     if words[0] == "--policies":
         words = words[1:]
     with pytest.raises(UsageError, match=message):
-        airl("degrade", *words, "--out", str(tmp_path / "curve"))
+        airl("latency-sweep", *words, "--out", str(tmp_path / "curve"))
     assert not (tmp_path / "curve").exists()

@@ -12,8 +12,14 @@ from pydantic import TypeAdapter
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from airl_mav.addons.identification.rehearse_flight import (
+    FLOWN,
+    REHEARSED,
+    Rehearsals,
+    from_its_start,
+    rehearse_flight,
+)
 from airl_mav.addons.recordings.recorded_flight import episode_of, take_in
-from airl_mav.addons.refit.refly import FLOWN, REHEARSED, Rehearsals, from_its_start, refly
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import (
     Decision,
@@ -214,7 +220,9 @@ def test_rehearsed_where_it_flew_it_is_the_same_flight(
 ) -> None:
     """Tolerances cover the lockstep hold: no message arrives while an action is held."""
     out = tmp_path / "out"
-    found = refly(recorded.path, out, Rehearsals(arena=demo_scenario().arena_name, episodes=2))
+    found = rehearse_flight(
+        recorded.path, out, Rehearsals(arena=demo_scenario().arena_name, episodes=2)
+    )
     (flown,) = run.episodes
     assert flown.quality is not None
     assert found.flown_s == flown.quality.flight_time_s
@@ -227,9 +235,9 @@ def test_rehearsed_where_it_flew_it_is_the_same_flight(
     (contrast,) = comparison.contrasts
     assert contrast.paired.flight_time_s.difference.n == 1
     with pytest.raises(FieldError, match="a new or empty folder"):
-        refly(recorded.path, out)
+        rehearse_flight(recorded.path, out)
     with pytest.raises(FieldError, match="one with the goal of the flight"):
-        refly(recorded.path, tmp_path / "other", Rehearsals("static-obstacles", 4))
+        rehearse_flight(recorded.path, tmp_path / "other", Rehearsals("static-obstacles", 4))
 
 
 def test_code_that_a_recording_names_is_not_run_unasked(tmp_path: Path) -> None:
@@ -254,7 +262,7 @@ def test_code_that_a_recording_names_is_not_run_unasked(tmp_path: Path) -> None:
     file.write(Decision(0, 0, 0, 0, 0, 0, -1, still, still, level, 9.0, level), 0)
     file.finish()
     with pytest.raises(FieldError, match="it is code that would run on this machine"):
-        refly(file.path, tmp_path / "out")
+        rehearse_flight(file.path, tmp_path / "out")
 
 
 def test_a_flight_is_moved_to_where_its_navigation_began(recorded: Recorded) -> None:

@@ -300,7 +300,7 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
 @pytest.mark.parametrize(
     ("changed", "named"),
     [
-        ({"kind": "gap"}, "kind = 'test', not 'gap'"),
+        ({"kind": "sweep"}, "kind = 'test', not 'sweep'"),
         ({"settings": {"policy": "other"}}, "policy = 'greedy', not 'other'"),
         (
             {"cells": {"a": declared([gym_cell("a", hold_s=0.7)]).cells["a"]}},
@@ -332,9 +332,8 @@ def test_another_campaign_is_not_mixed_in(
     [
         ("run.json", "a single run"),
         ("train.json", "a training"),
-        ("gap.json", "a verdict, or a gap of an earlier version"),
+        ("hardware-gap.json", "a verdict"),
         # Begun by a version that wrote no declaration.
-        *((f"{kind}.json", "runs of an earlier version") for kind in ("ladder", "matrix")),
     ],
 )
 def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, what: str) -> None:

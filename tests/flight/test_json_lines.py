@@ -98,17 +98,17 @@ def test_flights_one_after_the_other_in_lines(tmp_path: Path) -> None:
 def test_a_comparison_in_lines(tmp_path: Path) -> None:
     out = tmp_path / "curve"
     words = [*GREEDY, "--latencies", "native", "200ms", "--episodes", "2", "--json"]
-    code, text = airl("degrade", *words, "--out", str(out))
+    code, text = airl("latency-sweep", *words, "--out", str(out))
     assert code == 0
     lines = lines_of(text)
-    assert lines[0]["command"] == "airl degrade"
+    assert lines[0]["command"] == "airl latency-sweep"
     flights = of(lines, "flight")
     assert len(flights) == 4
     runs = lines[-1]["runs"]
     assert {Path(run["path"]).resolve() for run in runs} == {
         Path(flight["path"]).resolve() for flight in flights
     }
-    comparison = load_comparison(out, "degradation")
+    comparison = load_comparison(out, "latency-sweep")
     assert [run["name"] for run in runs] == [run.name for run in comparison.runs]
     # Of all runs together there is a count, too.
     last = [line for line in of(lines, "progress") if line["work"] == "all 2 runs"][-1]

@@ -317,13 +317,13 @@ def episodes_of(folder: Path) -> dict[int, dict[str, Any]]:
     return {episode["seed"]: episode for episode in lines}
 
 
-@pytest.mark.nightly  # As much is closed by test_gap_command.py.
+@pytest.mark.nightly  # As much is closed by test_hardware_gap_command.py.
 def test_an_untrained_for_latency_costs_little_once_it_is_compensated(tmp_path: Path) -> None:
     """The paper's 396 ms: of 60 seeds `static-obstacles` loses few, and flies hardly longer."""
     words = ["static-obstacles", "--latencies", "11ms", "396ms", "--compensated"]
     words += ["--episodes", "60", "--seed", "900000", "--out", str(tmp_path)]
-    with patch.object(show, "write_document", lambda _, folder: folder / "degradation.html"):
-        code, text = airl("degrade", *words)
+    with patch.object(show, "write_document", lambda _, folder: folder / "latency-sweep.html"):
+        code, text = airl("latency-sweep", *words)
     assert code == 0
     assert "static-obstacles, compensated" in text
     names = ("11ms", "396ms", "-compensated-11ms", "-compensated-396ms")

@@ -168,14 +168,14 @@ def test_what_is_shown_is_what_was_flown(decisions: str) -> None:
         _, _, done, infos = env.step(rng.integers(0, 4, 6))
         if done[0]:
             ends.append(infos[0])
-    refly = EpisodeReplay(spec)
+    replay = EpisodeReplay(spec)
     for tape, info in zip(taping.done, ends, strict=True):
-        moments = list(refly.moments(tape, 7_000_000))
+        moments = list(replay.moments(tape, 7_000_000))
         times = [moment.time_us for moment in moments]
         assert times == sorted(times)
         episode = info["episode"]
         assert tape.outcome == episode["outcome"]
-        fleet = refly.navigation.whole_truth().fleet
+        fleet = replay.navigation.whole_truth().fleet
         assert fleet.time_us[0] / 1e6 == episode["flight_time_s"]
         assert fleet.distance[0] == episode["distance_m"]
         assert fleet.energy[0] == episode["energy_j"]

@@ -68,35 +68,36 @@ def test_declared_results_are_there(records: dict[str, Record]) -> None:
 def fresh(records: dict[str, Record]) -> Record:
     """Return a result of today's code, independent of all accepted changes."""
     made = {"behaviour": record.behaviour_today(), "policies": dict(record.shipped_policies())}
-    gap = records["gap"]
+    gap = records["hardware-gap"]
     return gap.model_copy(update={"made": gap.made.model_copy(update=made)})
 
 
 def test_an_older_behaviour_is_said_under_its_tables(
     records: dict[str, Record], fresh: Record
 ) -> None:
-    today, records = fresh, {**records, "gap": fresh}
+    today, records = fresh, {**records, "hardware-gap": fresh}
     older = today.model_copy(update={"made": today.made.model_copy(update={"behaviour": "0" * 16})})
     text = "<!-- results: mitigation-gaps -->\n<!-- end of results -->"
     assert "before today" not in pages.rendered(text, records, "page")
-    said = pages.rendered(text, {**records, "gap": older}, "page")
+    said = pages.rendered(text, {**records, "hardware-gap": older}, "page")
     made = today.made
     flown = f"Flown on {made.date} with version {made.version}"
     assert f"**{flown}, before today's flight behaviour.**" in said
     # The figures are equal: only the text about them differs.
-    assert said.split("`airl gap")[0] == pages.rendered(text, records, "page").split("`airl gap")[0]
+    again = pages.rendered(text, records, "page")
+    assert said.split("`airl hardware-gap")[0] == again.split("`airl hardware-gap")[0]
 
 
 def test_a_page_with_a_provenance_block_lists_its_commands_there(
     records: dict[str, Record], fresh: Record
 ) -> None:
-    records = {**records, "gap": fresh}
+    records = {**records, "hardware-gap": fresh}
     marks = "".join(
         f"<!-- results: {name} -->\n<!-- end of results -->\n"
         for name in ("mitigation-gaps", "mitigation-runs", "provenance")
     )
     tables, listed = pages.rendered(marks, records, "page").split("<!-- results: provenance -->")
-    assert "airl " not in tables and tables.count("`results/gap.json`") == 2
+    assert "airl " not in tables and tables.count("`results/hardware-gap.json`") == 2
     assert listed.count(f"`{fresh.made.command}` | {fresh.made.date}") == 1
 
 
@@ -243,7 +244,7 @@ def test_a_table_of_runs_is_collected_and_shown(tmp_path: Path) -> None:
     for name, run in result.runs.items():
         assert found.runs[name].success_rate.value == pytest.approx(run.quality.success_rate.value)
     with pytest.raises(UsageError, match="no hardware gap here"):
-        collect(declare("airl gap", "gap"), tmp_path / "matrix", None)
+        collect(declare("airl hardware-gap", "hardware-gap"), tmp_path / "matrix", None)
 
 
 def test_a_roofline_is_collected_as_a_table(tmp_path: Path) -> None:
@@ -299,11 +300,11 @@ def test_flying_writes_quick_results_apart(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_what_must_be_flown_again_is_known(tmp_path: Path, fresh: Record) -> None:
-    declared = read_declared()["gap"]
+    declared = read_declared()["hardware-gap"]
     assert flying.why_out_of_date(declared, tmp_path) == "Not flown yet."
     record.write_record(fresh, tmp_path)
     assert flying.why_out_of_date(declared, tmp_path) == ""
-    other = declared.model_copy(update={"command": "airl gap --episodes 7"})
+    other = declared.model_copy(update={"command": "airl hardware-gap --episodes 7"})
     assert "another command" in flying.why_out_of_date(other, tmp_path)
     older: Made = fresh.made.model_copy(update={"behaviour": None})
     record.write_record(fresh.model_copy(update={"made": older}), tmp_path)

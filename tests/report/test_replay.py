@@ -223,7 +223,7 @@ def test_the_page_plays_steps_and_shows_the_other_run(watched: Watched) -> None:
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a campaign of three cells: two with flights, one damaged."""
-    path = tmp_path_factory.mktemp("campaign") / "gap"
+    path = tmp_path_factory.mktemp("campaign") / "hardware-gap"
     for name, episodes in (("late", 3), ("early", 2)):
         write_demo_run(path / name, episodes=episodes, profile="static-obstacles")
     (path / "gone").mkdir()

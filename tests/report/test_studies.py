@@ -157,8 +157,8 @@ def test_a_wrong_field_gets_one_line(old: str, new: str, message: str, tmp_path:
 def test_degradation_is_that_of_the_flights(degraded: tuple[Path, str]) -> None:
     out, text = degraded
     runs = [f"greedy-{latency}" for latency in LATENCIES]
-    check_contrasts(out, "degradation", {(runs[0], runs[2]), *pairwise(runs)})
-    told = {run["entry"]["name"]: run for run in comparison(out, "degradation")["runs"]}
+    check_contrasts(out, "latency-sweep", {(runs[0], runs[2]), *pairwise(runs)})
+    told = {run["entry"]["name"]: run for run in comparison(out, "latency-sweep")["runs"]}
     assert list(told) == runs
     for name, run in told.items():
         value = run["quality"]["success_rate"]["value"]
@@ -229,8 +229,8 @@ def test_system_evaluation_is_the_gap_of_every_arena(tmp_path: Path) -> None:
     names = [
         (f"{arena}-reference", f"{arena}-target") for arena in ("no-obstacles", "static-obstacles")
     ]
-    check_contrasts(tmp_path / "out", "gap", set(names))
-    gap = comparison(tmp_path / "out", "gap")
+    check_contrasts(tmp_path / "out", "hardware-gap", set(names))
+    gap = comparison(tmp_path / "out", "hardware-gap")
     t2_ms = [run["stages"]["t2"]["mean"] / 1e3 for run in gap["runs"]]
     assert t2_ms == pytest.approx([11.0, 396.0, 10.0, 542.0], rel=0.05)
     policies = [run["setup"]["policy"]["name"] for run in gap["runs"]]
@@ -311,10 +311,10 @@ def test_mitigation_is_the_gap_of_two_policies(tmp_path: Path) -> None:
         (f"{a}-target", f"{a}-mitigated"),
         (f"{a}-reference", f"{a}-mitigated-reference"),
     }
-    held = comparison(tmp_path / "out", "gap")["contrasts"]
+    held = comparison(tmp_path / "out", "hardware-gap")["contrasts"]
     found = {(c["entry"]["reference"], c["entry"]["target"]) for c in held}
     assert pairs <= found
-    check_contrasts(tmp_path / "out", "gap", found)
+    check_contrasts(tmp_path / "out", "hardware-gap", found)
     assert not list((tmp_path / "out").glob("train-*"))
 
 
@@ -411,20 +411,20 @@ def test_the_same_command_flies_nothing_more(degraded: tuple[Path, str]) -> None
     out, text = degraded
     files = [*out.rglob("episodes.jsonl")]
     before = {file: file.stat().st_mtime_ns for file in files}
-    held = comparison(out, "degradation")
+    held = comparison(out, "latency-sweep")
     code, again = study("degradation", DEGRADATION, out)
     assert code == 0
     assert again.count("(flown before)") == len(files) == 6
     assert "(flown before)" not in text
     assert {file: file.stat().st_mtime_ns for file in files} == before
-    assert comparison(out, "degradation") == held
+    assert comparison(out, "latency-sweep") == held
 
 
 def test_fewer_episodes_or_another_kind_are_another_study(degraded: tuple[Path, str]) -> None:
     out, _ = degraded
     with pytest.raises(UsageError, match="episodes = 12, not 11"):
         study("degradation", DEGRADATION, out, "--episodes", "11")
-    with pytest.raises(UsageError, match="kind = 'degradation', not 'matrix'"):
+    with pytest.raises(UsageError, match="kind = 'latency-sweep', not 'matrix'"):
         config = 'policies = ["greedy"]\narenas = ["no-obstacles"]\n'
         study("generalisation", config, out)
 

@@ -32,7 +32,7 @@ def verdict(out: Path, *, page: bool = False, **options: Any) -> tuple[int, str]
     with (
         nullcontext()
         if page
-        else patch.object(show, "write_document", lambda _, folder: folder / "gap.html")
+        else patch.object(show, "write_document", lambda _, folder: folder / "hardware-gap.html")
     ):
         return airl("verdict", *option_words(**(LATE | {"out": out} | options)))
 
@@ -101,7 +101,7 @@ def test_what_it_leaves(whole: tuple[Path, str]) -> None:
     (suite,) = root.iter("testsuite")
     assert suite.attrib["name"] == "airl verdict"
     assert "not met" in (out / "badge.svg").read_text()
-    page = (out / "gap.html").read_text()
+    page = (out / "hardware-gap.html").read_text()
     box = re.search(r'<div class="verdict not-met" role="status">(.*?)</div>', page, re.S)
     assert box is not None
     assert "does not meet: success &gt;= 95 %" in box[1]
@@ -131,7 +131,7 @@ def test_the_same_folder_answers_other_questions(whole: tuple[Path, str]) -> Non
     assert finding["estimate"]["high"] < 92.0
     assert (code, said(out)["status"]) == (5, "undecided")
     assert re.search(r"about [\d,]+ more flights would tell", text)
-    with patch.object(show, "write_document", lambda _, folder: folder / "gap.html"):
+    with patch.object(show, "write_document", lambda _, folder: folder / "hardware-gap.html"):
         code, again = airl("report", str(out))
     assert code == 0
     assert "too few flights to tell: success >= 92 %" in again

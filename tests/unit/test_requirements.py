@@ -147,7 +147,7 @@ def test_nothing_flown_decides_nothing() -> None:
 
 
 def test_a_gap_needs_a_reference() -> None:
-    with pytest.raises(FieldError, match="airl gap"):
+    with pytest.raises(FieldError, match="airl hardware-gap"):
         find(parse_requirement("flight_time gap <= 10 %"), QUALITY, None)
 
 

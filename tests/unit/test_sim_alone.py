@@ -36,14 +36,16 @@ COMPARE = """
 from airl_mav.cli.options import carry_out
 words = ["greedy", "--arena", "no-obstacles", "--episodes", "1", "--out", "run"]
 more = ["--latencies", "1ms", "50ms", "--workers", "1"]
-raise SystemExit(carry_out("airl degrade", "airl_mav.cli.degrade_command", words + more))
+raise SystemExit(
+    carry_out("airl latency-sweep", "airl_mav.cli.latency_sweep_command", words + more)
+)
 """
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
     ("program", "page"),
-    [(FLY, "run/report.html"), (COMPARE, "run/degradation.html")],
+    [(FLY, "run/report.html"), (COMPARE, "run/latency-sweep.html")],
     ids=["a run", "a comparison"],
 )
 def test_flies_and_draws_without_other_extras(tmp_path: Path, program: str, page: str) -> None:

@@ -17,8 +17,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
-from airl_mav.experiments.gap import training_environment
 from airl_mav.experiments.gym_flier import navigation_of
+from airl_mav.experiments.hardware_gap import training_environment
 from airl_mav.policy.actions import discrete_actions
 from airl_mav.policy.card import (
     ONNX_FILE,

@@ -27,7 +27,7 @@ from airl_mav.core.files import write_json
 from airl_mav.core.machine import provenance
 from airl_mav.core.progress import new_console
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask
-from airl_mav.experiments.gap import DEFAULT_WORKLOAD
+from airl_mav.experiments.hardware_gap import DEFAULT_WORKLOAD
 from airl_mav.latency.injection import ESTIMATE, Injection, choose_injection
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.learned import load_learned

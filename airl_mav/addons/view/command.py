@@ -25,13 +25,13 @@ from airl_mav.scenario.aircraft import GREATEST_PORT
 class ViewOptions(ProfileModel):
     """Replay the flights of a run in a browser, the worst first; Ctrl-C ends it.
 
-    For a campaign (airl evaluate of several policies, gap, degrade, ...) any two runs can be
+    For a campaign (airl evaluate of several policies, hardware-gap, ...) any two runs can be
     selected on the page, which starts with the first run.
 
     Examples:
         airl view runs/20261122T101530Z-sitl-static-obstacles
         airl view runs/A 7 --beside runs/B
-        airl view runs/20261122T114501Z-gap
+        airl view runs/20261122T114501Z-hardware-gap
         airl view flights/20261123T101530.123456Z.mcap
     """
 

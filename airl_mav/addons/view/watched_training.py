@@ -162,19 +162,19 @@ class WatchedTraining(TrainingProgress):
     # --- the view's side, in a thread
 
     def _run(self) -> None:
-        refly, shown_us = EpisodeReplay(self._environment), 0
+        replay, shown_us = EpisodeReplay(self._environment), 0
         while not self._ended.is_set():
             if self._newest:
-                shown_us = self._show(refly, self._newest.pop(), shown_us)
+                shown_us = self._show(replay, self._newest.pop(), shown_us)
             else:
                 self._ended.wait(LOOK_S)
         self._pace.close()
         self._feed.close()
 
-    def _show(self, refly: EpisodeReplay, taped: Taped, began_us: int) -> int:
+    def _show(self, replay: EpisodeReplay, taped: Taped, began_us: int) -> int:
         """Show a flight that begins at a time of the view [µs]; return the time of its end."""
         now_us = began_us
-        for moment in refly.moments(taped, began_us):
+        for moment in replay.moments(taped, began_us):
             now_us = began_us + moment.time_us
             self._pace.tick(now_us)
             if self._ended.is_set():

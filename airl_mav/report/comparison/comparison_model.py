@@ -19,8 +19,8 @@ T = TypeVar("T")
 SCHEMA = 2
 """Schema version of a comparison's files, described in docs/reference/run-folder.md."""
 
-Kind = Literal["compare", "gap", "ladder", "matrix", "degradation"]
-"""Kind of comparison and stem of its files: `gap.json`, `gap.html`, `gap.md`."""
+Kind = Literal["compare", "hardware-gap", "compare-levels", "matrix", "latency-sweep"]
+"""Kind of comparison and stem of its files: `matrix.json`, `matrix.html`, `matrix.md`."""
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -237,10 +237,10 @@ _QUESTION = TypeAdapter(_StoredQuestion)
 
 KIND_NAMES: dict[Kind, str] = {
     "compare": "comparison",
-    "gap": "hardware gap",
-    "ladder": "ladder",
+    "hardware-gap": "hardware gap",
+    "compare-levels": "comparison of levels",
     "matrix": "table of policies x arenas",
-    "degradation": "degradation curve",
+    "latency-sweep": "latency sweep",
 }
 
 

@@ -16,11 +16,11 @@ from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import run_verdict
 from airl_mav.report.comparison import (
+    compare_levels_page,
     comparison_model,
-    degradation_page,
     figures,
-    gap_page,
-    ladder_page,
+    hardware_gap_page,
+    latency_sweep_page,
     tables,
 )
 from airl_mav.report.comparison.build import compare, comparison_document
@@ -111,7 +111,7 @@ def judge_comparison(
 
 
 def _judged(comparison: comparison_model.Comparison) -> tuple[comparison_model.ComparedRun, ...]:
-    if comparison.kind != "gap":
+    if comparison.kind != "hardware-gap":
         return comparison.runs
     judged = []
     for group in comparison.groups:
@@ -422,9 +422,9 @@ _KINDS: dict[
     ],
 ] = {
     "compare": (build_runs, runs_document),
-    "gap": (gap_page.build_gap, gap_page.document_of),
-    "ladder": (ladder_page.build_ladder, ladder_page.document_of),
+    "hardware-gap": (hardware_gap_page.build_hardware_gap, hardware_gap_page.document_of),
+    "compare-levels": (compare_levels_page.build_compare_levels, compare_levels_page.document_of),
     "matrix": (build_matrix, matrix_document),
-    "degradation": (degradation_page.build_degradation, degradation_page.document_of),
+    "latency-sweep": (latency_sweep_page.build_latency_sweep, latency_sweep_page.document_of),
 }
 """Functions that build the comparison and its document, by kind."""

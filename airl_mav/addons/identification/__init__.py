@@ -1,0 +1,19 @@
+"""System identification: vehicle and computer profiles estimated from recorded flights.
+
+`identify` estimates drag, thrust, response, wind and latencies; `rehearse_flight` repeats
+the flight in simulation.
+Commands: `airl identify`, `airl rehearse-flight`. From Python: `identification.identify.identify`.
+Depends on: black boxes and vehicle logs (`airl_mav.black_box`, `airl_mav.vehicle_log`), lockstep.
+Guide: docs/how-to/refit.md.
+"""
+
+COMMANDS = {
+    "identify": (
+        "vehicle and computer profiles from a recorded flight",
+        "airl_mav.addons.identification.identify_command",
+    ),
+    "rehearse-flight": (
+        "rehearse a flight that was recorded, and compare the two",
+        "airl_mav.addons.identification.rehearse_flight_command",
+    ),
+}
