@@ -151,8 +151,9 @@ class Guidance:
         # After lift-off, the climb continues from the ramp.
         limit = context.climb.ramp(self._spool_since_us, context.value, time_us, flies=straight)
         (north, east, _), (vn, ve, vd) = demand.position, demand.velocity
-        # Limit only the climb; NaN means no vertical velocity is commanded.
-        down = -limit if math.isnan(vd) else max(vd, -limit)
+        # Limit only the climb; NaN or zero beside a height means that the height commands it.
+        higher = vd == 0.0 and demand.position[2] < context.home[2]
+        down = -limit if math.isnan(vd) or higher else max(vd, -limit)
         return Demand((north, east, NAN), (vn, ve, down), demand.yaw, demand.yaw_rate)
 
 

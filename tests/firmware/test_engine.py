@@ -218,3 +218,24 @@ def test_room_never_exceeds_the_distance_to_what_is_hit() -> None:
                     assert not clear
                     break
             assert plant._touching
+
+
+def fly_to(simulation: Simulation, end_us: int) -> None:
+    while simulation.time_us < end_us:
+        simulation.advance(end_us)
+
+
+def test_a_position_setpoint_takes_off() -> None:
+    simulation = new_simulation()
+    autopilot = simulation.autopilot.internals
+    assert autopilot is not None
+    fly_to(simulation, 5_000_000)
+    north, east = simulation.truth.position[:2]
+    assert autopilot.arm(force=False) == 0
+    for step in range(120):
+        above = np.array([north, east, -3.0])
+        autopilot.offer_setpoint(Setpoint(above, NAN3, 0.0, math.nan), simulation.time_us)
+        if step == 0:
+            assert autopilot.set_mode(Mode.OFFBOARD) == 0
+        fly_to(simulation, simulation.time_us + STEP_US)
+    assert simulation.truth.position[2] < -2.0
