@@ -4,7 +4,7 @@ Checks a flight controller over MAVSDK against the assumptions of a rehearsal, f
 and compares them with PX4's. Always lands.
 Command: `airl conformance`. From Python: `conformance.command.check_conformance`.
 Depends on: MAVSDK; needs no other add-on.
-Guide: docs/conformance.md.
+Guide: docs/reference/conformance.md.
 """
 
 COMMANDS = {

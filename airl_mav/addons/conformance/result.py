@@ -171,7 +171,7 @@ class ConformanceSettings(BaseModel):
     )
     steps: tuple[str, ...] | None = Field(
         default=None,
-        description="names of the steps to fly, as north-2 yaw-90 (docs/conformance.md); by default"
+        description="names of the steps to fly, as north-2 yaw-90 (docs/reference/conformance.md); by default"
         " all",
     )
     steps_only: bool = Field(
@@ -245,7 +245,7 @@ class ConformanceResult:
         return f"CONFORMS to {self.reference.title if self.reference else ''}: {counted}"
 
     def as_data(self) -> dict[str, Any]:
-        """Return all results in the file format of docs/conformance.md."""
+        """Return all results in the file format of docs/reference/conformance.md."""
         settings = self.settings
         return {
             "schema": SCHEMA,
