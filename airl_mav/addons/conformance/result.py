@@ -171,8 +171,7 @@ class ConformanceSettings(BaseModel):
     )
     steps: tuple[str, ...] | None = Field(
         default=None,
-        description="names of the steps to fly, as north-2 yaw-90 (docs/reference/conformance.md); by default"
-        " all",
+        description="names of the steps to fly, as north-2 yaw-90; by default all",
     )
     steps_only: bool = Field(
         default=False,
