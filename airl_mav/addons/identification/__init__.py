@@ -4,7 +4,7 @@
 the flight in simulation.
 Commands: `airl identify`, `airl rehearse-flight`. From Python: `identification.identify.identify`.
 Depends on: black boxes and vehicle logs (`airl_mav.black_box`, `airl_mav.vehicle_log`), lockstep.
-Guide: docs/how-to/refit.md.
+Guide: docs/how-to/after-the-flight.md.
 """
 
 COMMANDS = {
