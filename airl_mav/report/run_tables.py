@@ -407,6 +407,7 @@ def show_report(
         from airl_mav.report.run_report import write_report
 
         progress.status(DRAWING)
+        progress.line(DRAWING)
         page = write_report(run, verdict=verdict)
         progress.status(None)
     if run.episodes:

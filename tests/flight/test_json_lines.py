@@ -115,6 +115,23 @@ def test_a_comparison_in_lines(tmp_path: Path) -> None:
     assert (last["done"], last["planned"]) == (4, 4)
 
 
+def test_a_rehearsal_ends_with_one_sentence_and_prints_tables_on_request(tmp_path: Path) -> None:
+    words = option_words(policy="greedy", arena="no-obstacles", level="lockstep", episodes=1)
+    words += ["--latency", "lognormal:60ms,10ms", "--out", str(tmp_path / "run")]
+    code, text = airl("sitl", *words)
+    lines = text.splitlines()
+    assert code == 0
+    assert lines[-1] == (
+        "greedy on workstation with 60 ± 10 ms of injected latency in no-obstacles, level lockstep:"
+        " 1 of 1 goals reached, 100.0 % [20.7, 100.0]."
+    )
+    assert json.loads((tmp_path / "run" / "verdict.json").read_text())["sentences"] == lines[-1:]
+    assert "Quality of flight" not in text
+    _, again = airl("sitl", *words, "--tables")
+    assert "Quality of flight" in again
+    assert again.splitlines()[-1] == lines[-1]
+
+
 @pytest.mark.nightly
 def test_quiet_is_the_verdict_and_the_folder(tmp_path: Path) -> None:
     out = tmp_path / "run"

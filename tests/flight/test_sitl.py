@@ -77,7 +77,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     """The front door with its vehicle named (and a little faster, on free ports)."""
     folder = tmp_path_factory.mktemp("sitl")
     flights = ("--episodes", str(EPISODES), "--seed", str(SEED), "--speed", str(SPEED))
-    return sitl(folder, "--vehicle", "quad", *flights)
+    return sitl(folder, "--vehicle", "quad", "--tables", *flights)
 
 
 def test_folder_is_complete_and_nothing_else(done: Done) -> None:
@@ -254,6 +254,12 @@ def tables(output: str) -> list[str]:
     lines = [line.rstrip() for line in output.splitlines()]
     start = next(i for i, line in enumerate(lines) if line.startswith("vehicle "))
     return lines[start:]
+
+
+def test_the_output_ends_with_one_sentence(done: Done) -> None:
+    saved = json.loads((done.folder / "verdict.json").read_text(encoding="utf-8"))
+    assert done.output.splitlines()[-1] == saved["sentences"][0]
+    assert "level sitl: 2 of 2 goals reached, 100.0 % [34.2, 100.0]" in done.output
 
 
 def test_report_again_says_the_same(done: Done) -> None:
