@@ -22,6 +22,7 @@ from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot.inputs import PositionYaw, Reposition
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
 from firmware_sim.mavlink.codec import message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -225,12 +226,29 @@ def fly_to(simulation: Simulation, end_us: int) -> None:
         simulation.advance(end_us)
 
 
+def test_a_reposition_takes_off() -> None:
+    simulation = new_simulation()
+    autopilot = simulation.autopilot.internals
+    assert autopilot is not None
+    fly_to(simulation, 5_000_000)
+    north, east = simulation.truth.position[:2].tolist()
+    above = Reposition(PositionYaw((north, east, -5.0), math.nan))
+    # As in PX4, a disarmed vehicle does not take off later.
+    assert autopilot.set_mode(Mode.HOLD, above) == 0
+    assert autopilot.arm(force=False) == 0
+    fly_to(simulation, 8_000_000)
+    assert simulation.truth.position[2] > -0.5
+    assert autopilot.set_mode(Mode.HOLD, above) == 0
+    fly_to(simulation, 20_000_000)
+    assert abs(simulation.truth.position[2] + 5.0) < 0.5
+
+
 def test_a_position_setpoint_takes_off() -> None:
     simulation = new_simulation()
     autopilot = simulation.autopilot.internals
     assert autopilot is not None
     fly_to(simulation, 5_000_000)
-    north, east = simulation.truth.position[:2]
+    north, east = simulation.truth.position[:2].tolist()
     assert autopilot.arm(force=False) == 0
     for step in range(120):
         above = np.array([north, east, -3.0])

@@ -158,6 +158,13 @@ class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
         self._travelling = False
         self._settling = False
         """True if Hold still climbs to the altitude of an ended take-off."""
+        self._rises = False
+        """True if an armed vehicle on the ground takes off to a place above it."""
+
+    @property
+    def lifts(self) -> bool:
+        """True if the place is above the armed vehicle. Source: PX4 1.16, FlightTaskAuto."""
+        return self._rises
 
     @property
     def is_steady(self) -> bool:
@@ -181,9 +188,15 @@ class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
             self._go(request, state)
         else:
             self._place = interface.here(state)
+        context, down = self._context, self._place.position[2]
+        above = down < context.home[2] - ABOVE_HOME_M
+        self._rises = self._travelling and above and context.standing and context.armed
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Brake first, then hold the position of the stop."""
+        if self._rises and self._context.standing:
+            return leave_ground(self._context, state, time_us)
+        self._rises = False
         if self._travelling:
             place = self._place
             leg = PathSegment(place.position)
