@@ -4,7 +4,7 @@ A page requests a section with a comment on a separate line:
 
 - `<!-- fields: MODULE:MODEL -->` becomes a table of the fields of a pydantic model and of the
   models inside it: name, meaning, unit and range, default.
-- `<!-- help: COMMAND -->` becomes the output of `COMMAND --help`.
+- `<!-- help: COMMAND -->` becomes the output of `COMMAND --help-all`.
 - `<!-- tables: MODULE:FUNCTION -->` becomes the Markdown that a function returns.
 """
 
@@ -154,7 +154,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def help_text(command: str) -> str:
-    """Return the output of a command's `--help` as a text block."""
+    """Return the output of a command's `--help-all` as a text block."""
     program, *rest = command.split()
     entry: Callable[[], Any] = getattr(
         importlib.import_module("airl_mav.cli.main"), program.removeprefix("airl-")
@@ -163,12 +163,12 @@ def help_text(command: str) -> str:
     plain = {"COLUMNS": HELP_COLUMNS, "NO_COLOR": "1", "TERM": "dumb"}
     with (
         mock.patch.dict(os.environ, plain),
-        mock.patch.object(sys, "argv", [program, *rest, "--help"]),
+        mock.patch.object(sys, "argv", [program, *rest, "--help-all"]),
         contextlib.redirect_stdout(printed),
         contextlib.suppress(SystemExit),
     ):
         entry()
     text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).strip("\n")
     if not text:
-        raise RuntimeError(f"{command} --help printed nothing")
+        raise RuntimeError(f"{command} --help-all printed nothing")
     return f"```text\n{text}\n```"

@@ -179,7 +179,7 @@ def read_damaged(what: str, number: int) -> str:
     said = io.StringIO()
     try:
         with redirect_stdout(said), redirect_stderr(said):
-            code = carry_out("airl", subcommands()[command.replace("_", "-")][1], words)
+            code = carry_out("airl", subcommands()[command.replace("_", "-")][2], words)
         assert code == 0, f"exit status {code}"
     except UsageError as error:
         assert str(error).strip(), "refused without a word"

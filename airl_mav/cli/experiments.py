@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.shared_options import Gate, Telling, Voice, leave, requirements_of
-from airl_mav.core.fields import quantity
+from airl_mav.core.fields import COMMON, quantity
 from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import Aircraft
 
@@ -39,11 +39,13 @@ class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions,
 class OnboardOptions(Gate, ExperimentOptions):
     """Options for a policy on an onboard computer, compared with a reference."""
 
+    GROUP: ClassVar[str] = "latency"
+
     computer: str = Field(
         default=model.ONBOARD_COMPUTER,
         description="onboard computer: a shipped profile, or a path to a .toml",
     )
-    reference: str = Field(
+    reference: Annotated[str, COMMON] = Field(
         default=model.REFERENCE_COMPUTER,
         description="computer that the onboard computer is compared with: a shipped profile, or a"
         " path",

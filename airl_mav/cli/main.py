@@ -9,7 +9,6 @@ from functools import partial
 from typing import NoReturn
 
 from rich.console import Console
-from rich.table import Table
 
 from airl_mav import __version__
 from airl_mav.core.addons import entries
@@ -17,34 +16,43 @@ from airl_mav.core.errors import EXIT_USAGE
 from airl_mav.core.progress import new_console
 from airl_mav.core.unsupported import refer
 
-SUBCOMMANDS: dict[str, str] = {
+GROUPS = {
+    "fly": "Fly",
+    "learn": "Learn",
+    "measure": "Measure",
+    "judge": "Judge",
+    "logs": "Recorded flights and logs",
+    "show": "Show",
+}
+"""Groups of commands with their titles, in the order of `airl --help`."""
+
+SUBCOMMANDS: dict[str, tuple[str, str]] = {
     # To add one: write cli/<name>_command.py with OPTIONS and run(), and a line here. Add-ons have
     # a table of their own.
-    "sitl": "rehearse a policy: firmware and companion as two processes, a report (airl-sitl)",
-    "firmware": "flight controller, vehicle and camera alone, for any client (airl-firmware)",
-    "companion": "what runs on the drone's onboard computer (airl-companion)",
-    "evaluate": "fly policies through seeded episodes, with intervals",
-    "verdict": "does a policy hold on an onboard computer: as few flights as that takes",
-    "hardware-gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
-    " mitigation",
-    "latency-sweep": "the same policy at growing latencies: where it breaks down",
-    "compare-levels": "the same policy and seeds at several levels of the fidelity levels",
-    "train": "train a policy on the batch twin",
-    "export": "turn a stable-baselines3 model into a policy folder",
-    "report": "a run's tables and page again, or a comparison of several runs",
-    "arena": "look at an arena, or at what its profile draws",
-    "parameters": "a vehicle's parameters as a file for firmware that you start",
-    "computers": "computer profiles: what each was timed with, by whom, and how late it decides",
-    "list": "shipped vehicles, arenas, policies, computers, sweeps",
+    "sitl": ("fly", "rehearse a policy and write a report (airl-sitl)"),
+    "firmware": ("fly", "run flight controller, vehicle and camera (airl-firmware)"),
+    "companion": ("fly", "run the policy on the drone's computer (airl-companion)"),
+    "parameters": ("fly", "write a vehicle's parameters for PX4 or ArduPilot"),
+    "train": ("learn", "train a policy in the vectorized simulator"),
+    "export": ("learn", "convert a stable-baselines3 or PyTorch model to a policy"),
+    "evaluate": ("measure", "fly policies on fixed seeds: success, time, energy"),
+    "hardware-gap": ("measure", "measure what an onboard computer costs a policy"),
+    "latency-sweep": ("measure", "fly policies at increasing latencies"),
+    "compare-levels": ("measure", "compare simulation levels on the same seeds"),
+    "computers": ("measure", "list computer profiles and their latencies"),
+    "verdict": ("judge", "test a success rate with as few flights as possible"),
+    "report": ("show", "print and draw a run, or compare runs"),
+    "arena": ("show", "list and draw an arena"),
+    "list": ("show", "list vehicles, arenas, policies, computers, sweeps"),
 }
-"""Subcommands with their purposes; module `airl_mav.cli.<name>_command`."""
+"""Subcommands with their group and purpose; module `airl_mav.cli.<name>_command`."""
 
 
-def subcommands() -> dict[str, tuple[str, str]]:
-    """Return all subcommands, add-ons last: purpose and module by name."""
+def subcommands() -> dict[str, tuple[str, str, str]]:
+    """Return all subcommands, add-ons last: group, purpose and module by name."""
     core = {
-        name: (purpose, f"airl_mav.cli.{name.replace('-', '_')}_command")
-        for name, purpose in SUBCOMMANDS.items()
+        name: (group, purpose, f"airl_mav.cli.{name.replace('-', '_')}_command")
+        for name, (group, purpose) in SUBCOMMANDS.items()
     }
     return core | entries("airl_mav", "COMMANDS")
 
@@ -69,24 +77,20 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
             f"error: airl {name}: no such command; {hint}", style="red"
         )
         sys.exit(EXIT_USAGE)
-    _run(f"airl {name}", known[name][1], rest)
+    _run(f"airl {name}", known[name][2], rest)
 
 
 def _print_help(console: Console) -> None:
-    console.print("usage: airl COMMAND [OPTIONS]", highlight=False)
-    addons = {name: purpose for name, (purpose, _) in entries("airl_mav", "COMMANDS").items()}
-    for title, commands in (("Commands", SUBCOMMANDS), ("Add-ons", addons)):
-        if not commands:
-            continue
-        console.print(f"\n{title}:", highlight=False)
-        table = Table.grid(padding=(0, 2), pad_edge=True)
-        for name, purpose in commands.items():
-            table.add_row(name, purpose)
-        console.print(table)
-    console.print(
-        "\nairl COMMAND --help shows its options and examples; airl --version the version.",
-        highlight=False,
-    )
+    lines = ["usage: airl COMMAND [OPTIONS]", ""]
+    for group, title in GROUPS.items():
+        lines.append(f"{title}:")
+        lines += (
+            f"  {name:<17}{purpose}"
+            for name, (of, purpose, _) in subcommands().items()
+            if of == group
+        )
+    lines += ["", "airl COMMAND --help shows examples and options; airl --version the version."]
+    console.print("\n".join(lines), highlight=False, markup=False)
 
 
 # --- entry points of the console scripts

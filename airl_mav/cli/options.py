@@ -55,7 +55,13 @@ _FIELD = re.compile(r"\b[a-z0-9]+(?:_[a-z0-9]+)+\b")
 
 
 def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Options:
-    """Read a command line, or a first word .toml, into its model, whose docstring is the help."""
+    """Read a command line, or a first word .toml, into its model; SystemExit after a help text."""
+    if {"-h", "--help", "--help-all"} & set(words):
+        # Imported here: only help needs it.
+        from airl_mav.cli.help_texts import help_text
+
+        sys.stdout.write(help_text(model, prog, everything="--help-all" in words) + "\n")
+        raise SystemExit(0)
     words = _with_values(model, words)
     held: dict[str, Any] = {}
     file = _scenario_file(model, words)
@@ -175,18 +181,18 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
             kind = inner if prefix else Annotated[(inner, tyro.conf.OmitArgPrefixes)]
             fields.append((name, kind, dataclasses.field(default_factory=inner)))
             continue
-        marks: list[Any] = [tyro.conf.arg(help=_help(field), name=CALLED.get(name))]
+        marks: list[Any] = [tyro.conf.arg(help=meaning_of(field), name=CALLED.get(name))]
         if POSITIONAL in field.metadata:
             marks = [
                 tyro.conf.Positional,
-                tyro.conf.arg(help=_help(field), metavar=_metavar(name, kind)),
+                tyro.conf.arg(help=meaning_of(field), metavar=metavar_of(name, kind)),
             ]
         if REPEATED in field.metadata:
             marks.append(tyro.conf.UseAppendAction)
         there = held.get(name)
         if IN_WORDS in field.metadata:
             kind = tuple[str, ...]
-            marks = [tyro.conf.arg(help=_help(field), name=SINGULAR[name], metavar="TEXT")]
+            marks = [tyro.conf.arg(help=meaning_of(field), name=SINGULAR[name], metavar="TEXT")]
             marks.append(tyro.conf.UseAppendAction)
             there = [str(Fault.model_validate(item)) for item in there or ()]
         default = dataclasses.field(default=_default(field, there))
@@ -205,14 +211,15 @@ def _default(field: FieldInfo, held: Any) -> Any:
     return tyro.MISSING if field.is_required() else field.get_default(call_default_factory=True)
 
 
-def _metavar(name: str, kind: Any) -> str:
+def metavar_of(name: str, kind: Any) -> str:
+    """Return the placeholder of a positional."""
     if "tuple" not in str(kind):
         return name.upper()
     one = f"{name[:-3]}y" if name.endswith("ies") else name.removesuffix("s")
     return f"[{one.upper()} ...]"
 
 
-def _help(field: FieldInfo) -> str:
+def meaning_of(field: FieldInfo) -> str:
     """Return a field's meaning with its range and unit, as a sentence."""
     meaning = field.description or ""
     meaning = meaning[:1].upper() + meaning[1:]

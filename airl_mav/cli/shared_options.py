@@ -16,7 +16,7 @@ from airl_mav.cli.options import REPEATED, check_installed
 from airl_mav.core.addons import entries, load
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import COMMON, ProfileModel, quantity
 from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress, new_console
 from airl_mav.rehearsal.live_view import ViewRequest
 from airl_mav.scenario.aircraft import GREATEST_PORT
@@ -37,7 +37,9 @@ TrustArenas = Annotated[
 class Gate(ProfileModel):
     """Requirements, and files for the verdict."""
 
-    require: Annotated[tuple[str, ...], REPEATED] = Field(
+    GROUP: ClassVar[str] = "requirements"
+
+    require: Annotated[tuple[str, ...], REPEATED, COMMON] = Field(
         default=(),
         description="requirement, decided on the 95 % interval, as 'success >= 95 %'; may be"
         " repeated. Exit status 3: not met, 5: too few flights to decide",
@@ -81,7 +83,9 @@ def leave(gate: Gate, verdict: OverallVerdict, suite: str) -> None:
 class Viewing(ProfileModel):
     """Live view of flights."""
 
-    view: bool = Field(
+    GROUP: ClassVar[str] = "output"
+
+    view: Annotated[bool, COMMON] = Field(
         default=False,
         description="show the flights in a browser while they fly, at an address that is printed"
         " (docs/how-to/view-and-export.md); in lockstep they fly in real time, or at --speed",
@@ -126,6 +130,8 @@ SCHEMA = 1
 
 class Telling(ProfileModel):
     """Output mode of a command."""
+
+    GROUP: ClassVar[str] = "output"
 
     quiet: bool = Field(
         default=False,

@@ -3,7 +3,7 @@
 The `__init__` of an add-on is light and may define tables, which the core reads by name. In
 `airl_mav.addons`:
 
-    COMMANDS: {command of `airl`: (purpose, module with OPTIONS and run)}
+    COMMANDS: {command of `airl`: (group of `airl --help`, purpose, module with OPTIONS and run)}
     COLOUR: {part of colour cameras, see `camera.render.colour`: object}
     EXECUTORS: {value of `--executor`: module with `connected`}
     EXPORTS: {option of `airl export`: function from a policy's folder to a new policy}

@@ -57,6 +57,34 @@ TYPES = {
 """Accepted input by pydantic's error type."""
 
 
+COMMON = "most used"
+"""Marks an option of `--help`; `--help-all` shows all options."""
+
+GROUPS = (
+    "options",
+    "policy",
+    "episodes",
+    "arena",
+    "latency",
+    "aircraft",
+    "domain randomization",
+    "sensors",
+    "firmware and links",
+    "execution",
+    "limits",
+    "requirements",
+    "output",
+)
+"""Groups of options in `--help-all`, in order. A model names the group of its fields as `GROUP`."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Marks an option with another group than its model's."""
+
+    name: str
+
+
 class ProfileModel(BaseModel):
     """Base of all profile models: immutable, unknown fields rejected."""
 

@@ -5,6 +5,8 @@ The tables are used by scenarios and training environments.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from airl_mav.core.constants import G_PER_KG, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
@@ -52,6 +54,8 @@ class Spread(ProfileModel):
     The flight controller still assumes the profile's values.
     """
 
+    GROUP: ClassVar[str] = "domain randomization"
+
     mass: float = quantity("mass and inertia, +- this share", "1", ge=0, le=0.9, default=0.0)
     thrust: float = quantity("greatest thrust, +- this share", "1", ge=0, le=0.9, default=0.0)
     drag: float = quantity("drag, +- this share", "1", ge=0, le=0.9, default=0.0)
@@ -62,6 +66,8 @@ class Spread(ProfileModel):
 
 class SensorNoise(ProfileModel):
     """Scale of sensor noise relative to the profile."""
+
+    GROUP: ClassVar[str] = "sensors"
 
     navigation_noise: float = quantity(
         "noise, bias and drift of IMU, GPS, barometer and magnetometer, times this; where the"

@@ -7,12 +7,20 @@ Meaning, unit, range and default of a setting are defined only here.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from airl_mav.core.constants import CommandKind
-from airl_mav.core.fields import ProfileModel, field_error, optional, quantity, switch
+from airl_mav.core.fields import (
+    COMMON,
+    Group,
+    ProfileModel,
+    field_error,
+    optional,
+    quantity,
+    switch,
+)
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import KINDS, UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
@@ -24,13 +32,20 @@ Place = tuple[
 ]
 """Latitude, longitude [deg], altitude above mean sea level [m]; PX4's limits for an origin."""
 
-ArenaName = Annotated[str, Field(description="arena profile: a shipped name, or a path to a .toml")]
+ArenaName = Annotated[
+    str,
+    Field(description="arena profile: a shipped name, or a path to a .toml"),
+    COMMON,
+    Group("arena"),
+]
 PolicyName = Annotated[
     str,
     Field(
         description="policy that decides: a name, a path to a folder with policy.onnx and"
         " card.json, or a Python class as FILE.py:CLASS or MODULE:CLASS"
     ),
+    COMMON,
+    Group("policy"),
 ]
 
 DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles-fast", "static-obstacles"
@@ -60,6 +75,8 @@ DECISION_TIMEOUT_S = 2.0
 
 class WatchdogSettings(ProfileModel):
     """Timeouts for a silent policy, in simulated time."""
+
+    GROUP: ClassVar[str] = "limits"
 
     decision_timeout_s: float | None = quantity(
         "time since the last action after which the velocity is zeroed; longer than the hold time;"
@@ -103,6 +120,8 @@ class WatchdogSettings(ProfileModel):
 
 class LimitSettings(ProfileModel):
     """Limits on telemetry, camera and flight; a violation ends the flight."""
+
+    GROUP: ClassVar[str] = "limits"
 
     silence_s: float = quantity(
         "telemetry that stays the same for longer, and frames that come later, are not believed",
@@ -173,6 +192,8 @@ class PilotSettings:
 class Inference(ProfileModel):
     """Settings of network inference."""
 
+    GROUP: ClassVar[str] = "policy"
+
     runtime: RuntimeName = Field(
         default="onnx", description="runtime of a learned policy; torch needs its policy.pt2"
     )
@@ -185,6 +206,8 @@ class Inference(ProfileModel):
 
 class Decisions(Inference):
     """Policy settings and flight settings of its actions."""
+
+    GROUP: ClassVar[str] = "policy"
 
     cpu_quota: float | None = quantity(
         "hold the companion to this share of one core, for real, by a Linux control group; what it"
@@ -226,7 +249,7 @@ class Decisions(Inference):
         " with the newest frame as soon as the one before is ready; by default as the policy's card"
         " says, or sequential"
     )
-    compensate: bool | None = optional(
+    compensate: Annotated[bool | None, Group("latency")] = optional(
         "compensate the latency: state and depth image are carried forward to when the"
         " decision is expected to act, by the vehicle's response to the setpoints in flight; by"
         " default as the policy's card says, or not"
@@ -252,16 +275,18 @@ class Decisions(Inference):
 class Lateness(ProfileModel):
     """Decision latency t2, in simulated time."""
 
-    computer: str = Field(
+    GROUP: ClassVar[str] = "latency"
+
+    computer: Annotated[str, COMMON] = Field(
         default="workstation",
         description="computer profile to fly as: a shipped name, or a path to a .toml",
     )
-    workload: str | None = optional(
+    workload: Annotated[str | None, COMMON] = optional(
         "workload of the computer profile whose latency t2 is injected; estimate:"
         " scaled to this policy; by default what was measured for this very policy, or else what"
         " this machine takes (sitl) or 1 ms (gym, lockstep)"
     )
-    latency: str | None = optional(
+    latency: Annotated[str | None, COMMON] = optional(
         "latency t2 to inject instead of the workload's: 150ms, lognormal:396ms,20ms"
         " (mean, standard deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured"
         " latencies, one a line in ms, which are replayed in order"
@@ -273,6 +298,8 @@ class Lateness(ProfileModel):
 
 class Workers(ProfileModel):
     """Execution of an experiment's jobs; has no effect on results."""
+
+    GROUP: ClassVar[str] = "execution"
 
     executor: Annotated[Literal["process", "ray"], FREE] = Field(
         default="process",
@@ -296,20 +323,26 @@ class Workers(ProfileModel):
 class Flights(Workers):
     """Episodes of a run and their execution."""
 
-    level: LevelName = Field(
+    GROUP: ClassVar[str] = "episodes"
+
+    level: Annotated[LevelName, COMMON, Group("execution")] = Field(
         default="sitl",
         description="fidelity level. gym: the vectorized simulator, some hundred episodes a"
         " second. lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the"
         " same flight every time, bit by bit. sitl: two processes over UDP, in real time times the"
         " speed",
     )
-    episodes: int = quantity("number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3)
-    seed: int = _seed("episode i uses seed + i for arena, sensors, wind, spread and latency")
-    arena_seed: int | None = _seed(
+    episodes: Annotated[int, COMMON] = quantity(
+        "number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3
+    )
+    seed: Annotated[int, COMMON] = _seed(
+        "episode i uses seed + i for arena, sensors, wind, spread and latency"
+    )
+    arena_seed: Annotated[int | None, Group("arena")] = _seed(
         "every episode in the arena, and with the goal, of this one seed; by default of its own",
         None,
     )
-    zone: int | None = quantity(
+    zone: Annotated[int | None, Group("arena")] = quantity(
         "curriculum zone of the arena that every goal is drawn in: 0 is the smallest, around the"
         " start; by default the largest, the whole arena",
         "1",
@@ -324,7 +357,7 @@ class Flights(Workers):
         " gym always begins in a hover",
     )
     time_limit_s: TimeLimit = TIME_LIMIT_S
-    speed: Annotated[float | None, FREE, NO_TWIN] = quantity(
+    speed: Annotated[float | None, FREE, NO_TWIN, Group("execution")] = quantity(
         "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"
         " to 1000 (default: as fast as it goes)",
         "1",
@@ -337,14 +370,14 @@ class Flights(Workers):
         description="level sitl: fly again what the host disturbed, as it is no test of the policy;"
         " without, every flight counts, and the report says so",
     )
-    slots: Annotated[int, FREE] = quantity(
+    slots: Annotated[int, FREE, Group("execution")] = quantity(
         "level gym: flights at a time; decides the pace, not the results",
         "1",
         ge=1,
         le=GREATEST_SLOTS,
         default=128,
     )
-    tlogs: Annotated[bool, FREE] = switch(
+    tlogs: Annotated[bool, FREE, Group("output")] = switch(
         "level lockstep: write the logs of every flight (.tlog, .ulg); level sitl always does"
     )
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from airl_mav.core.constants import LOOPBACK, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, optional, quantity, switch
+from airl_mav.core.fields import COMMON, Group, ProfileModel, optional, quantity, switch
 from airl_mav.core.frames import Goal
 from airl_mav.faults import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
@@ -40,35 +40,41 @@ FARTHEST_M = 10_000.0
 class StandAloneVehicle(Aircraft):
     """Flight controller, vehicle and camera without a companion, for any client."""
 
+    GROUP: ClassVar[str] = "execution"
+
     arena: model.ArenaName = model.DEFAULT_ARENA
-    computer: str = Field(
+    computer: Annotated[str, COMMON, Group("aircraft")] = Field(
         default="workstation",
         description="computer profile that is on board, for its mass and its power: a shipped name,"
         " or a path to a .toml",
     )
-    seed: int = quantity(
+    seed: Annotated[int, COMMON] = quantity(
         "seed of arena, sensors, wind and spread", "1", ge=0, le=model.GREATEST_SEED, default=1
     )
-    speed: float | Literal["max"] | None = optional(
+    speed: Annotated[float | Literal["max"] | None, COMMON] = optional(
         "simulated seconds per wall second, above 0, at most 100; max: as fast as it"
         " goes, for clients that do not live by the wall clock; by default 1, in lockstep max"
     )
-    duration: float | None = quantity(
+    duration: Annotated[float | None, COMMON] = quantity(
         "end after this simulated time; by default on Ctrl-C", "s", ge=0, le=1e6, default=None
     )
     firmware_log: Path | None = optional(
         "with real firmware that is started here: what it prints goes to this file"
     )
-    bind: str = Field(default=LOOPBACK, description="IPv4 address that links and camera bind")
-    companion_host: str = Field(
+    bind: Annotated[str, Group("firmware and links")] = Field(
+        default=LOOPBACK, description="IPv4 address that links and camera bind"
+    )
+    companion_host: Annotated[str, Group("firmware and links")] = Field(
         default=LOOPBACK, description="IPv4 address of the companion computer"
     )
-    gcs_host: str = Field(default=LOOPBACK, description="IPv4 address of the ground station")
-    insecure: bool = switch(
+    gcs_host: Annotated[str, Group("firmware and links")] = Field(
+        default=LOOPBACK, description="IPv4 address of the ground station"
+    )
+    insecure: Annotated[bool, Group("firmware and links")] = switch(
         "allow addresses that other machines can reach without a signing key: MAVLink"
         " has no other authentication"
     )
-    lockstep: bool = switch(
+    lockstep: Annotated[bool, COMMON] = switch(
         "simulated time waits for one companion that passes turns (airl-companion"
         " --lockstep, or any program that keeps to docs/reference/lockstep-protocol.md): the same"
         " flight every time, bit by bit; there is no ground station then, and the companion's end"
@@ -109,7 +115,7 @@ class StandAloneVehicle(Aircraft):
         "keep the parameters that clients set in this file: read at the start, written"
         " after every change; QGroundControl loads it, too"
     )
-    tlog: Path | None = optional(
+    tlog: Annotated[Path | None, COMMON, Group("output")] = optional(
         "write the MAVLink log of the onboard link to this file, and the vehicle's log"
         " (.ulg) beside it"
     )
@@ -140,43 +146,47 @@ CameraName = Annotated[
 class CompanionAddresses(ProfileModel):
     """Connections of a stand-alone companion to flight controller and camera."""
 
-    connect: str = Field(
+    GROUP: ClassVar[str] = "firmware and links"
+
+    connect: Annotated[str, COMMON] = Field(
         default="udpin://127.0.0.1:14540",
         description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
         " serial://DEVICE:BAUD",
     )
-    camera: CameraName = "tcp://127.0.0.1:5600"
+    camera: Annotated[CameraName, COMMON] = "tcp://127.0.0.1:5600"
 
 
 class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
     """Stand-alone companion that flies a policy, onboard or against any simulator."""
+
+    GROUP: ClassVar[str] = "execution"
 
     signing_key: Path | None = optional(
         "sign MAVLink with the key in this file, that of the flight controller (64"
         " hexadecimal digits, mode 0600); over udpin:// only"
     )
     policy: model.PolicyName = model.DEFAULT_POLICY
-    goal: Goal = Field(
+    goal: Annotated[Goal, COMMON] = Field(
         default=(20.0, 0.0),
         description="goal, north and east of the start, m, within 10 km; with a third number, down:"
         " -4 is 4 m above the start; without it the goal has no height",
     )
-    start: Start = Field(
+    start: Annotated[Start, COMMON] = Field(
         default="arm",
         description="arm: arms, takes off, flies to the goal and lands; offboard: a pilot"
         " takes off and hands over in flight by switching to Offboard (ArduPilot: GUIDED); the"
         " companion gives the vehicle back in Hold and never arms or lands it",
     )
-    vehicle: str = Field(
+    vehicle: Annotated[str, COMMON, Group("aircraft")] = Field(
         default="quad",
         description="vehicle profile: compensation uses its response to setpoints and its camera's"
         " mount",
     )
-    check: bool = switch(
+    check: Annotated[bool, COMMON] = switch(
         "look at camera, flight controller and policy on the ground, say what is wrong,"
         " and end: nothing is armed, no setpoint is sent"
     )
-    lockstep: bool = switch(
+    lockstep: Annotated[bool, COMMON] = switch(
         "take turns with a simulator that waits for this program (airl-firmware"
         " --lockstep): every flight of a seed is the same"
     )
@@ -201,8 +211,10 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
         le=3600,
         default=30.0,
     )
-    log: Path | None = optional("write the stamps of every decision to this .npz file")
-    black_box: Path | None = optional(
+    log: Annotated[Path | None, Group("output")] = optional(
+        "write the stamps of every decision to this .npz file"
+    )
+    black_box: Annotated[Path | None, COMMON, Group("output")] = optional(
         "record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
         " telemetry, images, status and resources; it survives a crash up to its last second, and"
         " airl report shows it"
@@ -212,7 +224,7 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
         " flight controller's collision prevention (CP_DIST), which holds back a pilot in Position"
         " mode"
     )
-    black_box_images_hz: float = quantity(
+    black_box_images_hz: Annotated[float, Group("output")] = quantity(
         "most images that the black box keeps, each one that a decision saw",
         "Hz",
         ge=0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch import nn
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import optional, switch, validated
+from airl_mav.core.fields import COMMON, optional, switch, validated
 from airl_mav.core.machine import package_versions
 from airl_mav.core.plugins import names_code
 from airl_mav.envs.observations import LENS, further_seen
@@ -127,9 +127,9 @@ DEFAULTS: dict[str, Any] = {
 class ModelProperties(NamedTuple):
     """Properties read from a model: its images, and its action set."""
 
-    image: str | None = None
+    image: Annotated[str | None, COMMON] = None
     frames: int | None = None
-    actions: ActionSetName | None = None
+    actions: Annotated[ActionSetName | None, COMMON] = None
     kind: CameraKind | None = None
     goal_height: bool | None = None
 
@@ -142,23 +142,27 @@ class ExportRequest(BaseModel):
         " function that makes one, as MODULE:NAME or FILE.py:NAME; or a policy, by its name or"
         " folder, to be written in integers, or to fly otherwise"
     )
-    algorithm: str | None = optional(
+    algorithm: Annotated[str | None, COMMON] = optional(
         "class that wrote a .zip, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C,"
         " ...; of a module of your own only a note on the card"
     )
-    weights: Path | None = optional("state_dict of a module of your own, as torch.save wrote it")
-    vec_normalize: Path | None = optional(
+    weights: Annotated[Path | None, COMMON] = optional(
+        "state_dict of a module of your own, as torch.save wrote it"
+    )
+    vec_normalize: Annotated[Path | None, COMMON] = optional(
         "what the `save` of the VecNormalize around the training environment wrote, for"
         " a .zip: its statistics become part of the network"
     )
-    like: str | None = optional(
+    like: Annotated[str | None, COMMON] = optional(
         "training configuration whose environment the model was made for, a shipped"
         " name or a path to a .toml: says all that follows and is left out"
     )
-    out: Path = Field(description="folder to write policy.onnx and card.json to")
-    name: str | None = optional("short name of the policy; by default that of the folder")
+    out: Annotated[Path, COMMON] = Field(description="folder to write policy.onnx and card.json to")
+    name: Annotated[str | None, COMMON] = optional(
+        "short name of the policy; by default that of the folder"
+    )
     description: str = Field(default="", description="one line about the policy")
-    layout: LayoutName | None = optional(
+    layout: Annotated[LayoutName | None, COMMON] = optional(
         "observation layout that the model was trained with; by default body"
     )
     image: str | None = optional(
@@ -209,7 +213,7 @@ class ExportRequest(BaseModel):
         "time since the last action after which a decision was overdue in training, s;"
         " by default as the companion has it"
     )
-    decisions: DecisionTiming | None = optional(
+    decisions: Annotated[DecisionTiming | None, COMMON] = optional(
         "when a decision begins: sequential, after the hold of the one before, or"
         " pipelined, with the newest frame; by default sequential"
     )
@@ -218,7 +222,7 @@ class ExportRequest(BaseModel):
         description="share of random actions in flight, 0 to 1; discrete action sets only",
     )
     with_torch: bool = switch("also write policy.pt2, for the torch runtime")
-    int8: bool = switch(
+    int8: Annotated[bool, COMMON] = switch(
         "write a network in 8-bit integers, calibrated with frames of its own flights"
     )
 

@@ -13,7 +13,8 @@ _HERE = "airl_mav.addons.colour"
 
 COMMANDS = {
     "render": (
-        "what a colour camera sees: an arena as a picture, a flight as a film",
+        "show",
+        "draw an arena, or a film of a flight",
         f"{_HERE}.command",
     )
 }

@@ -22,7 +22,7 @@ from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import COMMON, ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.profiles import projections
@@ -83,15 +83,15 @@ class RenderOptions(ProfileModel):
     flight: Annotated[int | None, POSITIONAL] = Field(
         default=None, description="number of the run's flight; by default the worst"
     )
-    seed: int | None = quantity(
+    seed: Annotated[int | None, COMMON] = quantity(
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )
-    show: pictures.Shown = Field(
+    show: Annotated[pictures.Shown, COMMON] = Field(
         default="rgb",
         description="colour, its luma, depth (near is bright), segmentation (what is seen), or flow"
         " (how fast it moves over the image)",
     )
-    camera: str | None = Field(
+    camera: Annotated[str | None, COMMON] = Field(
         default=None,
         description="vehicle profile, a shipped name or a path to a .toml, whose camera takes the"
         " picture: its size, lens and sensor, one ray a pixel; where and how it looks is then where"
@@ -102,7 +102,7 @@ class RenderOptions(ProfileModel):
         description="with --camera: name of an additional camera in the profile ([cameras.NAME]);"
         " default: the main camera",
     )
-    speed_m_s: float = quantity(
+    speed_m_s: Annotated[float, COMMON] = quantity(
         "with --camera or --show flow: how fast it flies ahead", "m/s", ge=-100, le=100, default=0.0
     )
     yaw_rate_deg_s: float = quantity(
@@ -112,7 +112,7 @@ class RenderOptions(ProfileModel):
         le=1000,
         default=0.0,
     )
-    renderer: projections.Renderer = Field(
+    renderer: Annotated[projections.Renderer, COMMON] = Field(
         default="raycast", description="renderer; mitsuba draws rgb only, without fog"
     )
     samples: int | None = quantity(
@@ -122,7 +122,7 @@ class RenderOptions(ProfileModel):
         le=4096,
         default=None,
     )
-    out: Path | None = Field(
+    out: Annotated[Path | None, COMMON] = Field(
         default=None,
         description="the file to write: .png of an arena; .gif, .mp4 or .webp of a flight; .npy of"
         " either, the numbers of depth [m], segmentation or flow [px/s]; by default render.png or"
@@ -135,20 +135,20 @@ class RenderOptions(ProfileModel):
         default=False,
         description="run the arena generators named by the run: code by the author of the folder",
     )
-    north_m: float = quantity(
+    north_m: Annotated[float, COMMON] = quantity(
         "of the camera: distance north of the start", "m", ge=-1000, le=1000, default=0.0
     )
-    east_m: float = quantity(
+    east_m: Annotated[float, COMMON] = quantity(
         "of the camera: distance east of the start", "m", ge=-1000, le=1000, default=0.0
     )
-    height_m: float | None = quantity(
+    height_m: Annotated[float | None, COMMON] = quantity(
         "of the camera: height above the floor; by default the arena's flight altitude",
         "m",
         ge=0,
         le=1000,
         default=None,
     )
-    yaw_deg: float = quantity(
+    yaw_deg: Annotated[float, COMMON] = quantity(
         "heading of the camera, clockwise from north", "deg", ge=-360, le=360, default=0.0
     )
     pitch_up_deg: float = quantity("how far the camera looks up", "deg", ge=-90, le=90, default=0.0)

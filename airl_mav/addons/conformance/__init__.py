@@ -9,7 +9,8 @@ Guide: docs/reference/conformance.md.
 
 COMMANDS = {
     "conformance": (
-        "does a flight controller do what the rehearsal assumes?",
+        "judge",
+        "test a flight controller against the rehearsal",
         "airl_mav.addons.conformance.command",
     )
 }

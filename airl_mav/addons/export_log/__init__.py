@@ -8,7 +8,8 @@ Guide: docs/how-to/view-and-export.md.
 
 COMMANDS = {
     "export-log": (
-        "flights of a run as MCAP for Foxglove and rerun, or ULog; or live",
+        "logs",
+        "write flights as MCAP or ULog, or stream them",
         "airl_mav.addons.export_log.command",
     )
 }

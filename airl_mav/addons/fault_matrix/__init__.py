@@ -8,7 +8,8 @@ Guide: docs/how-to/fault-matrix.md.
 
 COMMANDS = {
     "faults": (
-        "every fault in every phase of a flight, and how it ended: the fault matrix",
+        "judge",
+        "inject every fault in every phase of a flight",
         "airl_mav.addons.fault_matrix.command",
     )
 }

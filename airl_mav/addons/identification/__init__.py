@@ -9,11 +9,13 @@ Guide: docs/how-to/after-the-flight.md.
 
 COMMANDS = {
     "identify": (
-        "vehicle and computer profiles from a recorded flight",
+        "logs",
+        "estimate vehicle and computer from a recorded flight",
         "airl_mav.addons.identification.identify_command",
     ),
     "rehearse-flight": (
-        "rehearse a flight that was recorded, and compare the two",
+        "logs",
+        "repeat a recorded flight in simulation, and compare",
         "airl_mav.addons.identification.rehearse_flight_command",
     ),
 }

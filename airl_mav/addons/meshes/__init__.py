@@ -8,7 +8,8 @@ Guide: docs/how-to/arena-assets.md.
 
 COMMANDS = {
     "asset": (
-        "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",
+        "show",
+        "make an arena obstacle from a mesh (STL, OBJ, GLB)",
         "airl_mav.addons.meshes.command",
     )
 }

@@ -9,7 +9,8 @@ Guide: docs/how-to/profile.md.
 
 COMMANDS = {
     "profile": (
-        "measure how long this computer takes for a policy's decisions",
+        "measure",
+        "measure this computer's latency for a policy",
         "airl_mav.addons.profiling.profile",
     )
 }

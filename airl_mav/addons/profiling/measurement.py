@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from airl_mav.addons.profiling.soak import Soak, write_soak_page
 from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, usage_errors
-from airl_mav.core.fields import quantity
+from airl_mav.core.fields import COMMON, quantity
 from airl_mav.core.files import save_arrays, write_json
 from airl_mav.core.machine import MachineState, package_versions
 from airl_mav.latency.injection import duration_ms
@@ -145,7 +145,7 @@ class ComputerMeasurement:
     before: MachineState
     after: MachineState
     power: DrawnPower
-    soak: Soak | None = None
+    soak: Annotated[Soak | None, COMMON] = None
     """Result of the soak, if requested."""
     files: tuple[Path, ...] = ()
     """Paths of written files: profile, samples, stamps, facts and soak."""
@@ -269,7 +269,7 @@ class ProfileRequest(CompanionAddresses, Inference):
         description="policy to measure: a name, or a path to a folder with policy.onnx and"
         " card.json; by default the default policy, or with a network a random one",
     )
-    network: str | None = Field(
+    network: Annotated[str | None, COMMON] = Field(
         default=None,
         pattern=r"^[1-9]\d?x[1-9]\d{0,2}$",
         description="LAYERSxFILTERS of a randomly initialised network of the paper's template to"
@@ -281,13 +281,13 @@ class ProfileRequest(CompanionAddresses, Inference):
         pattern=r"^\d{1,4}x\d{1,4}$",
         description="with a network: WIDTHxHEIGHT of the image that is its input, px",
     )
-    level: ProfileLevel = Field(
+    level: Annotated[ProfileLevel, COMMON] = Field(
         default="bare",
         description="bare: inference alone, on this computer. sitl: in flight, through the"
         " processes of airl-sitl, all stages. hil: the companion on this computer, against an"
         " airl-firmware that runs elsewhere",
     )
-    decisions: int = quantity(
+    decisions: Annotated[int, COMMON] = quantity(
         "decisions to measure, after the warm-up", "1", ge=10, le=100_000, default=1000
     )
     warm_up: int = quantity(
@@ -311,19 +311,19 @@ class ProfileRequest(CompanionAddresses, Inference):
         description="after the measurement, run inference alone for this time, as 90s, 10min or 1h,"
         " and record latency, frequency and temperature, to detect thermal throttling",
     )
-    on: str | None = Field(
+    on: Annotated[str | None, COMMON] = Field(
         default=None,
         pattern=NAME,
         description="name of the computer, and of its profile's file; by default after its"
         " processor",
     )
-    workload: str | None = Field(
+    workload: Annotated[str | None, COMMON] = Field(
         default=None,
         pattern=NAME,
         description="name of the workload in the profile; replaces an existing one; default: from"
         " policy, level, runtime and threads",
     )
-    watts: float | None = quantity(
+    watts: Annotated[float | None, COMMON] = quantity(
         "power that the computer draws; by default as measured, where this computer tells it,"
         " or that of an existing profile, or 0",
         "W",

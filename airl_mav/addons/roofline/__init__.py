@@ -8,7 +8,8 @@ Guide: docs/how-to/roofline.md.
 
 COMMANDS = {
     "roofline": (
-        "safe velocity against reaction time: which computer, and what binds it",
+        "measure",
+        "compute safe speed by reaction time and computer",
         "airl_mav.addons.roofline.roofline",
     )
 }

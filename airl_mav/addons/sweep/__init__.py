@@ -9,7 +9,8 @@ Guide: docs/how-to/sweep.md.
 
 COMMANDS = {
     "sweep": (
-        "train and evaluate many networks: the architecture search",
+        "learn",
+        "train and evaluate many networks",
         "airl_mav.addons.sweep.command",
     )
 }

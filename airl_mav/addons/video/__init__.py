@@ -8,7 +8,8 @@ Guide: docs/how-to/view-and-export.md.
 
 COMMANDS = {
     "video": (
-        "what the camera sees, in QGroundControl and other players of RTP",
+        "show",
+        "stream the camera to QGroundControl",
         "airl_mav.addons.video.command",
     )
 }

@@ -7,7 +7,7 @@ Depends on: the extra `view` (viser); `airl_mav.report.scene`.
 Guide: docs/how-to/view-and-export.md.
 """
 
-COMMANDS = {"view": ("replay the flights of a run in a browser", "airl_mav.addons.view.command")}
+COMMANDS = {"view": ("show", "replay a run in a browser", "airl_mav.addons.view.command")}
 
 VIEW = {
     "viewer": "airl_mav.addons.view.viewer:Viewer",
