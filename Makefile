@@ -66,8 +66,8 @@ budgets: $(ALL)  ## Lower scripts/budgets.toml to what is measured now, calls pe
 
 # What every worker of the tests would compile for itself: kernels, and modules. Kernels need what
 # flies and nothing else; while pip installs the package once more, it is found by its place.
-.PHONY: kernels-plant kernels-twin modules
-kernels-plant kernels-twin: kernels-%: $(FLY)
+.PHONY: kernels-plant kernels-gym modules
+kernels-plant kernels-gym: kernels-%: $(FLY)
 	PYTHONPATH=$(CURDIR) $(BIN)/python scripts/compile_kernels.py $*
 
 modules: $(ALL)
@@ -80,7 +80,7 @@ test nightly: export OMP_NUM_THREADS := 1
 # kernels are compiled while pip unpacks the rest, which is larger.
 .PHONY: test
 test: $(FLY)  ## Everything CI checks
-	@$(MAKE) --no-print-directory --jobs 2 --output-sync kernels-plant lint kernels-twin modules
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync kernels-plant lint kernels-gym modules
 	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD) -m "not nightly" --durations 25
 
 .PHONY: nightly

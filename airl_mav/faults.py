@@ -378,15 +378,15 @@ def link_fails(faults: Iterable[Fault]) -> bool:
 
 # --- faults supported by the vectorized simulator; its flights begin at the policy's takeover
 
-TWIN = "gym"
+GYM = "gym"
 """Fidelity level of the vectorized simulator."""
 
 
-def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
+def check_gym(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
     """Raise FieldError for a fault that the vectorized simulator does not support."""
     for fault in faults:
         levels = fault.about.levels
-        if TWIN not in levels:
+        if GYM not in levels:
             raise FieldError("faults", str(fault), f"at level {' or '.join(levels)}")
         if not _in_flight(fault):
             raise FieldError("faults", str(fault), "at offboard, or offboard+TIME, at level gym")

@@ -1,4 +1,4 @@
-"""The latency curve of a policy: the same seeds at growing latencies, in the batch twin."""
+"""Latency sweep of a policy: the same seeds at increasing latencies, at level gym."""
 
 from airl_mav import Scenario, latency_sweep
 

@@ -1,7 +1,7 @@
 """Compile every kernel of plant and vectorized simulator, before many processes need them.
 
 numba's cache is shared, but has no lock: processes that start together compile the same code each.
-`compile_kernels.py plant` and `compile_kernels.py twin` share little, and may run side by side.
+`compile_kernels.py plant` and `compile_kernels.py gym` share little, and may run side by side.
 """
 
 import sys
@@ -24,7 +24,7 @@ def compile_plant() -> None:
             warm_up(load_vehicle("quad"), plant)
 
 
-def compile_twin() -> None:
+def compile_gym() -> None:
     """Compile the kernels of the vectorized simulator and its cameras."""
     for kind in KINDS:
         short = {"episode": {"time_limit_s": 1.0}, "camera": {"kind": kind}}
@@ -33,7 +33,7 @@ def compile_twin() -> None:
             pass
 
 
-PARTS = {"plant": compile_plant, "twin": compile_twin}
+PARTS = {"plant": compile_plant, "gym": compile_gym}
 
 if __name__ == "__main__":
     for part in sys.argv[1:] or PARTS:

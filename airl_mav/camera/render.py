@@ -88,7 +88,7 @@ def camera_pose(
 def pose_of(
     position: Vec | NDArray[np.float64], quaternion: Quat | NDArray[np.float64]
 ) -> tuple[Vec, Quat]:
-    """Return a camera's pose as tuples, as in the batch twin, so that one renderer is compiled."""
+    """Return a camera's pose as tuples, as at level gym, so that one renderer is compiled."""
     north, east, down = (float(part) for part in position)
     w, x, y, z = (float(part) for part in quaternion)
     return (north, east, down), (w, x, y, z)

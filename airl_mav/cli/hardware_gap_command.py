@@ -41,8 +41,8 @@ class HardwareGapOptions(OnboardOptions):
     )
     mitigated: Annotated[str, COMMON, Group("policy")] = Field(
         default=DEFAULT_MITIGATED,
-        description="policy trained with the computer's latency: a name, or a path; none: fly the"
-        " gap without mitigation only",
+        description="policy trained with the computer's latency: a name, or a path; none: only"
+        " fly without mitigation",
     )
     arena: Annotated[tuple[str, ...], COMMON, Group("arena")] = Field(
         default=(DEFAULT_ARENA,),

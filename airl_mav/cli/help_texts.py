@@ -67,7 +67,7 @@ def help_text(model: type[BaseModel], prog: str, *, everything: bool) -> str:
     if not everything:
         lines += ["", "Options:"]
         lines += (line for o in (*positionals, *shown) for line in _lines(o, width, brief=True))
-        lines += ["", f"{prog} --help-all explains all {len(options)} options."]
+        lines += ["", f"--help-all explains all {len(options)} options."]
         return "\n".join(lines)
     for group in dict.fromkeys(each.group for each in (*positionals, *shown)):
         lines += ["", f"{group.capitalize()}:"]

@@ -65,7 +65,7 @@ def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement,
             raise FieldError(
                 "require",
                 str(requirement),
-                f"a gap only where a reference is flown, as by airl hardware-gap; {ACCEPTED}",
+                f"a gap only with a reference, as in airl hardware-gap; {ACCEPTED}",
             )
     return requirements
 

@@ -22,7 +22,7 @@ from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arena_batch import ArenaBatch, move_obstacles, relief_of
 from airl_mav.envs.decision import FrameTimes
-from airl_mav.envs.faults import delays_of, later_us, twin_faults
+from airl_mav.envs.faults import delays_of, gym_faults, later_us
 from airl_mav.envs.fleet import Fleet, FramePoses
 from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
@@ -72,7 +72,7 @@ class Eyes:
             self._colour = colour("batch")(self.intrinsics, self._mount, looks, self._meshes)
         self._formed: Any = None
         """Image formation for single images, as in the rehearsal; None without a table `imaging`.
-        It keeps no state between images (`check_twin_imaging`), so it serves all
+        It keeps no state between images (`check_gym_imaging`), so it serves all
         vehicles."""
         if camera.imaging is not None and looks is not None:
             self._formed, self._looks = colour("sensor")(camera, name), looks
@@ -159,7 +159,7 @@ class Cameras(Stateful):
             for name, each in (further or {}).items()
         }
         """Additional cameras by name, triggered with the main camera."""
-        failing = twin_faults(faults, "camera")
+        failing = gym_faults(faults, "camera")
         # Delays shift whole frames; the other faults change pixels.
         self._late = [each for each in failing if each.fault.kind == "delay"]
         self._first_us = np.zeros(n, np.int64)

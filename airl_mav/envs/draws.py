@@ -3,7 +3,7 @@
 An episode is therefore independent of the number of parallel flights. Draws for decisions are made
 ahead, a block of decisions at a time.
 
-Telemetry errors represent the EKF's error as noise on the batch twin's true state. Nine errors per
+Telemetry errors represent the EKF's error as noise on the simulator's true state. Nine errors per
 vehicle: position NED [m], velocity NED [m/s], attitude as a rotation about north, east and down
 [rad]. Each is an independent stationary first-order Gauss-Markov process. This is an approximation:
 where the magnetic field is steep, a tilt about north also changes the heading, and attitude is
@@ -25,7 +25,7 @@ from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.core.streams import Stream, sensors_and_gusts, stream
-from airl_mav.envs.faults import gusts, lasting, twin_faults
+from airl_mav.envs.faults import gusts, gym_faults, lasting
 from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.faults import Fault
@@ -133,7 +133,7 @@ class Winds(DrawnAhead):
     def __init__(self, n: int, settings: WindSettings, faults: Sequence[Fault] = ()) -> None:
         """Prepare n slots; `faults` of the wind act in all of them."""
         super().__init__(n)
-        self._faults = twin_faults(faults, "wind")
+        self._faults = gym_faults(faults, "wind")
         # Every field except the gust's time constant is 0.
         still = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
         self.calm = still and not self._faults

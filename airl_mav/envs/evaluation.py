@@ -40,7 +40,7 @@ OUTCOMES = {
     FlightStatus.BATTERY: Outcome.BATTERY,
     FlightStatus.TIMEOUT: Outcome.TIMEOUT,
 }
-"""Recorded outcome of each verdict of the batch twin."""
+"""Recorded outcome of each verdict of the vectorized simulator."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Faults of wind, camera and uplink in the batch twin.
+"""Faults of wind, camera and uplink in the vectorized simulator.
 
 Flights start when the policy takes over, in phase `offboard`, at time 0. A fault is the same for
 all vehicles; its random part uses the seed of each episode.
@@ -24,8 +24,8 @@ BEFORE_US = -FOREVER_US
 """Start time of faults active since before the flight."""
 
 
-class TwinFault(NamedTuple):
-    """Fault with its active times in a flight of the twin."""
+class GymFault(NamedTuple):
+    """Fault with its active times in a flight of the vectorized simulator."""
 
     number: int
     """Index of the fault in the episode, from 0."""
@@ -40,18 +40,18 @@ class TwinFault(NamedTuple):
         return acts
 
 
-def twin_faults(faults: Sequence[Fault], *parts: Part) -> list[TwinFault]:
-    """Return the faults of these parts that the twin supports, in the episode's order."""
+def gym_faults(faults: Sequence[Fault], *parts: Part) -> list[GymFault]:
+    """Return the faults of these parts that level gym supports, in the episode's order."""
     found = []
     for number, fault in enumerate(faults):
         if fault.part not in parts:
             continue
         from_us, to_us = window_us(fault, BEGINS) or (0, FOREVER_US)
-        found.append(TwinFault(number, fault, BEFORE_US if fault.phase is None else from_us, to_us))
+        found.append(GymFault(number, fault, BEFORE_US if fault.phase is None else from_us, to_us))
     return found
 
 
-def gusts(faults: Sequence[TwinFault], first_tick: int, ticks: int) -> Vector:
+def gusts(faults: Sequence[GymFault], first_tick: int, ticks: int) -> Vector:
     """Return the wind (ticks, 3) NED [m/s] of faults, starting with tick number `first_tick`."""
     time_us = TICK_US * np.arange(first_tick, first_tick + ticks)
     more = np.zeros((ticks, 3))
@@ -66,14 +66,14 @@ def gusts(faults: Sequence[TwinFault], first_tick: int, ticks: int) -> Vector:
     return more
 
 
-def lasting(faults: Sequence[TwinFault]) -> Vector:
+def lasting(faults: Sequence[GymFault]) -> Vector:
     """Return the wind (3,) NED [m/s] of faults active since before the flight."""
     since = [each.fault.value for each in faults if each.from_us == BEFORE_US]
     total: Vector = np.sum(np.array(since).reshape(-1, 3), axis=0)
     return total
 
 
-def later_us(faults: Sequence[TwinFault], time_us: NDArray[np.int64]) -> NDArray[np.int64]:
+def later_us(faults: Sequence[GymFault], time_us: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the additional delay of messages sent at these times, for faults `delay`."""
     more = np.zeros_like(time_us)
     for each in faults:
@@ -81,7 +81,7 @@ def later_us(faults: Sequence[TwinFault], time_us: NDArray[np.int64]) -> NDArray
     return more
 
 
-def delays_of(faults: Sequence[TwinFault]) -> NDArray[np.int64]:
+def delays_of(faults: Sequence[GymFault]) -> NDArray[np.int64]:
     """Return faults `delay` for kernels: (k, 3) start, end and delay, all [µs]."""
     rows = [(each.from_us, each.to_us, round(each.fault.amount * US_PER_S)) for each in faults]
     return np.array(rows, np.int64).reshape(-1, 3)
@@ -101,7 +101,7 @@ def acted(faults: Sequence[Fault], ended_us: int) -> list[tuple[str, int, int]]:
     """Return the faults active in a flight until its end [µs]: text, start and end of each."""
     told = []
     for fault in faults:
-        (each,) = twin_faults([fault], fault.part)
+        (each,) = gym_faults([fault], fault.part)
         from_us = max(each.from_us, 0)
         if from_us <= ended_us:
             told.append((str(fault), from_us, min(each.to_us, ended_us)))

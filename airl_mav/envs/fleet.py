@@ -1,4 +1,4 @@
-"""Vehicles of the batch twin: their state as arrays, and shared constants.
+"""Vehicles of the vectorized simulator: their state as arrays, and shared constants.
 
 `fleet_step.advance` simulates them.
 """

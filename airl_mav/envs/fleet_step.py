@@ -1,4 +1,4 @@
-"""Flight dynamics of the batch twin: rigid body and cascade at 250 Hz, in one compiled call.
+"""Flight dynamics of the vectorized simulator: rigid body and cascade at 250 Hz, compiled.
 
 Uses the rehearsal's kernels (`airl_mav.vehicle`, `airl_mav.control`), without estimator and
 MAVLink: control uses the true state. A setpoint in the heading frame is converted to NED when it

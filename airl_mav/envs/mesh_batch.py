@@ -1,4 +1,4 @@
-"""Meshes of n arenas as arrays, hills included, for the cameras of the batch twin.
+"""Meshes of n arenas as arrays, hills included, for the cameras of the vectorized simulator.
 
 Trees of files are stored once, for all arenas. The ground differs between arenas: behind the trees
 of files there is space for each arena's ground.

@@ -1,4 +1,4 @@
-"""N flights at a time: the companion's decision loop around the batch twin.
+"""N flights at a time: the companion's decision loop around the vectorized simulator.
 
 Decisions follow `companion.pilot`: the frame is older than the state, and the previous setpoint
 remains active during inference and until the new setpoint arrives. The hold starts when the
@@ -24,7 +24,7 @@ from airl_mav.envs.companions import Companions
 from airl_mav.envs.decision import Timing, begin_decision, new_decision
 from airl_mav.envs.draws import BLOCK, DelayDraws, TelemetryErrors, Winds
 from airl_mav.envs.episode_arenas import EpisodeArenas
-from airl_mav.envs.faults import delays_of, later_us, twin_faults
+from airl_mav.envs.faults import delays_of, gym_faults, later_us
 from airl_mav.envs.fleet import (
     STILL,
     Fleet,
@@ -44,7 +44,7 @@ from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import SHIPPED_REWARDS, EnvironmentSpec
 from airl_mav.envs.stopping import injections_of
 from airl_mav.envs.world import World, decide, status
-from airl_mav.faults import Fault, check_twin
+from airl_mav.faults import Fault, check_gym
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import UPRIGHT_S
 from airl_mav.policy.images import Bytes, body_bytes
@@ -129,13 +129,13 @@ class Navigation(Stateful):
             computer_w: Power of the onboard computer of `vehicle` from the pack [W].
             battery_charge: State of charge at the start of every flight, 1 full to 0 empty.
             compensator: Latency compensator of n companions; None = created if `spec` compensates.
-            faults: Faults of every flight, as supported by the twin (`envs.faults`); not part of a
+            faults: Faults of every flight, as supported at level gym (`envs.faults`); not part of a
                 saved state.
             commands: Command type of `fly`, velocity or body_rates; None = as in the actions of
                 `spec`.
 
         Raises:
-            UsageError: A profile is unusable, the camera does not match the layout, or the twin
+            UsageError: A profile is unusable, the camera does not match the layout, or level gym
                 does not support a fault.
         """
         self.spec = spec
@@ -187,11 +187,11 @@ class Navigation(Stateful):
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = TelemetryErrors(n, table, randomisation.navigation_noise)
         pipelined = spec.decisions == "pipelined"
-        check_twin(faults, pipelined=pipelined)
+        check_gym(faults, pipelined=pipelined)
         self._winds = Winds(n, spec.wind, faults)
         seen = (self.places.looks, self.places.meshes, sight.further)
         self.cameras = Cameras(n, self.camera, self._transport_us, randomisation, faults, *seen)
-        self._uplink = twin_faults(faults, "uplink")
+        self._uplink = gym_faults(faults, "uplink")
         self._decision = new_decision(self._times(pipelined=pipelined), self._telemetry.errors)
         self._stops = trace is not None or self._winds.gusty or self.cameras.may_freeze
         """True if decisions may need Python before their end."""
@@ -369,7 +369,7 @@ class Navigation(Stateful):
         return Kinematics(*(np.array(each[rows]) for each in state))
 
     def whole_truth(self) -> WholeTruth:
-        """Return the twin's complete state: live arrays, read-only by convention."""
+        """Return the simulator's complete state: live arrays, read-only by convention."""
         if self.places.begun.any():  # Before the first episode there is no arena.
             move_all_obstacles(self.places.batch, self.fleet.time_us)
         return WholeTruth(self.fleet, self.places.batch, self._vehicle)

@@ -35,7 +35,7 @@ from airl_mav.policy.images import (
     goes_round,
 )
 from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
-from airl_mav.profiles.camera import Camera, check_noise, check_twin_imaging
+from airl_mav.profiles.camera import Camera, check_gym_imaging, check_noise
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
 
@@ -55,7 +55,7 @@ def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
 
 
 COMPILED_SCANNING = Scanning(level_scan, carried)
-"""Scan functions of the batch twin."""
+"""Scan functions of the vectorized simulator."""
 
 
 @kernel
@@ -135,7 +135,7 @@ def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[
 
 
 COMPILED = Shrink(shrink_depth, shrink_colour, COMPILED_SCANNING)
-"""Image functions of the batch twin."""
+"""Image functions of the vectorized simulator."""
 
 
 @kernel
@@ -356,9 +356,9 @@ def further_seen(
 
 
 def check_conditions(sight: Sight, spec: EnvironmentSpec, faults: Sequence[Fault]) -> None:
-    """Raise FieldError for camera conditions that the twin does not support."""
+    """Raise FieldError for camera conditions that the vectorized simulator does not support."""
     further = sight.further.values()
     check_noise(sight.camera, spec.randomisation, faults, "randomisation", further)
-    check_twin_imaging(sight.camera)
+    check_gym_imaging(sight.camera)
     for name, camera in sight.further.items():
-        check_twin_imaging(camera, name)
+        check_gym_imaging(camera, name)

@@ -151,7 +151,7 @@ def _braking(vehicle_json: str) -> Braking:
 
 def measure_braking(vehicle: VehicleProfile) -> Braking:
     """Stop a vehicle at all speeds and times; see `Braking`. Takes half a second."""
-    shared = twin_of(vehicle)
+    shared = gym_constants_of(vehicle)
     top_m_s = shared.gains.vel_max_xy
     speeds = top_m_s * np.arange(1, SPEEDS + 1) / SPEEDS
     fleet = run_ups(shared, speeds, MOMENTS_S)
@@ -169,8 +169,8 @@ def measure_braking(vehicle: VehicleProfile) -> Braking:
     )
 
 
-def twin_of(vehicle: VehicleProfile) -> FleetConstants:
-    """Return the batch twin's constants of a vehicle, with the vehicle's parameters."""
+def gym_constants_of(vehicle: VehicleProfile) -> FleetConstants:
+    """Return the vectorized simulator's constants of a vehicle, with the vehicle's parameters."""
     return vehicle_of(vehicle, flown_values(vehicle.autopilot_parameters()).__getitem__)
 
 
@@ -244,7 +244,7 @@ class DecisionLoop:
 
     @classmethod
     def of(cls, vehicle: VehicleProfile, hold_s: float, delay: Delay | None = None) -> DecisionLoop:
-        """Return the loop for a vehicle's camera; the default delays are the twin's."""
+        """Return the loop for a vehicle's camera; the default delays are those of level gym."""
         delay = delay or Delay()
         return cls(
             frame_period_s=vehicle.camera.period_us / US_PER_S,

@@ -24,7 +24,7 @@ from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.executors import FlyEpisodes, Stop
-from airl_mav.faults import check_twin
+from airl_mav.faults import check_gym
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import measure_quality
@@ -132,7 +132,7 @@ class GymFlier:
         """Raise UsageError for settings that the vectorized simulator does not support."""
         environment = environment_of(self.scenario)
         pipelined = environment.decisions == "pipelined"
-        check_twin(self.scenario.scenario.faults, pipelined=pipelined)
+        check_gym(self.scenario.scenario.faults, pipelined=pipelined)
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
         """Return the episodes per job; see `executors.Flier`."""

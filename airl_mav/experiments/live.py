@@ -58,7 +58,9 @@ def fly_live(
     """Fly the rest of a scenario, one flight after the other, at level sitl or lockstep."""
     asked = scenario.scenario
     if asked.level == "gym":
-        raise FieldError("level", asked.level, "lockstep or sitl; airl evaluate flies the twin")
+        raise FieldError(
+            "level", asked.level, "lockstep or sitl; airl evaluate flies the vectorized simulator"
+        )
     check_program(asked)
     say = partial(progress.note, style="yellow")
     known = out is not None and (out / RUN_FILE).exists()

@@ -290,12 +290,12 @@ def check_renderer(
         drawn.check(each, arena)
 
 
-def check_twin_imaging(camera: Camera, name: str = "") -> None:
+def check_gym_imaging(camera: Camera, name: str = "") -> None:
     """Raise FieldError for auto-exposure lag, unsupported where only decisions take frames."""
     auto = None if camera.imaging is None else camera.imaging.auto_exposure
     if auto is not None and auto.time_constant_s > 0.0:
         raise FieldError(
             f"{f'cameras.{name}' if name else 'camera'}.imaging.auto_exposure.time_constant_s",
             auto.time_constant_s,
-            "0 in the batch twin, which takes the frames of decisions alone; any in lockstep",
+            "0 in the vectorized simulator, which renders decision frames only; any in lockstep",
         )

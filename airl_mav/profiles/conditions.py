@@ -71,7 +71,7 @@ class SensorNoise(ProfileModel):
 
     navigation_noise: float = quantity(
         "noise, bias and drift of IMU, GPS, barometer and magnetometer, times this; where the"
-        " estimator is a model of its error, that error. The estimator is not told",
+        " estimator is a model of its error, that error. The estimator keeps its nominal settings",
         "1",
         ge=0,
         le=10,

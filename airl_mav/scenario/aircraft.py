@@ -49,7 +49,7 @@ FREE = "decides no flight"
 IN_WORDS = "each in words on a command line"
 """Marks a list of texts, each a separate command-line option."""
 
-NO_TWIN = "at level lockstep or sitl; the twin has none"
+NOT_IN_GYM = "at level lockstep or sitl; the vectorized simulator has none"
 """Marks a field that must keep its default at level gym."""
 
 
@@ -143,16 +143,15 @@ class Aircraft(ProfileModel):
         description="faults that happen in every flight, in words: gps off at 8s for 5s; see"
         " docs/how-to/faults.md",
     )
-    estimator: Annotated[EstimatorName, NO_TWIN, Group("sensors")] = Field(
+    estimator: Annotated[EstimatorName, NOT_IN_GYM, Group("sensors")] = Field(
         default="kernel",
         description="filter of the state estimator: the compiled one, or filterpy's, its reference,"
         " some twenty times slower",
     )
     plant: PlantName = Field(
         default=DEFAULT_PLANT,
-        description="physics engine: pybullet, or the batch twin's compiled rigid body, which has"
-        " its own contact model, needs no pybullet and is the default without it; level gym has"
-        " neither",
+        description="physics engine: pybullet, or the vectorized simulator's compiled rigid body"
+        " (default without pybullet); not at level gym",
     )
     renderer: Annotated[Renderer, Group("sensors")] = Field(
         default="raycast",

@@ -16,7 +16,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
 from airl_mav.core.scheduling import check_permitted
-from airl_mav.faults import LINKS, TWIN, Fault, check_twin
+from airl_mav.faults import GYM, LINKS, Fault, check_gym
 from airl_mav.latency.injection import Injection, select_injection
 from airl_mav.policy.actions import KINDS, Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy
@@ -24,7 +24,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import SLOW, Renderer
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.scenario import model
-from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
+from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NOT_IN_GYM, Aircraft, Ports
 
 SITL_SPEEDS = 0.5, 10.0
 """Speed range supported by MAVSDK's wall-clock timeouts: slower, it misses heartbeats (1 Hz of
@@ -53,10 +53,10 @@ def check_level(scenario: model.Scenario) -> None:
     elif level == "gym":
         usual = model.Scenario()
         for field, declared in model.Scenario.model_fields.items():
-            if NO_TWIN not in declared.metadata:
+            if NOT_IN_GYM not in declared.metadata:
                 continue
             if (value := getattr(scenario, field)) != getattr(usual, field):
-                raise FieldError(field, value, NO_TWIN)
+                raise FieldError(field, value, NOT_IN_GYM)
     check_faults(scenario, level)
     check_drawing(scenario.renderer, level)
     if level != "lockstep" and scenario.tlogs:
@@ -80,14 +80,14 @@ def check_start(scenario: model.Scenario) -> None:
 
 def check_drawing(renderer: Renderer, level: model.LevelName) -> None:
     """Raise FieldError for a renderer that the level does not support."""
-    if renderer in SLOW and level == TWIN:
+    if renderer in SLOW and level == GYM:
         raise FieldError("renderer", renderer, "raycast, but at level lockstep or sitl")
 
 
 def check_faults(asked: Aircraft, level: model.LevelName) -> None:
     """Raise FieldError for a fault that the level or the firmware does not support."""
-    if level == TWIN:
-        check_twin(asked.faults)
+    if level == GYM:
+        check_gym(asked.faults)
     for fault in asked.faults:
         part, levels = fault.part, fault.about.levels
         if level not in levels:
@@ -146,7 +146,9 @@ def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str |
     if firmware == "builtin":
         return
     if level == "gym":
-        raise FieldError("firmware", firmware, "at level lockstep or sitl: the twin has its own")
+        raise FieldError(
+            "firmware", firmware, "at level lockstep or sitl: the vectorized simulator has its own"
+        )
     if level == "lockstep" and firmware != "px4":
         raise FieldError(
             "firmware",
@@ -224,7 +226,9 @@ def check_commands(
     """Raise FieldError for commands that the level or the firmware does not support."""
     kind = KINDS[policy.commands]
     if level not in kind.levels:
-        accepted = "at level lockstep or sitl: the batch twin flies velocities and body rates"
+        accepted = (
+            "at level lockstep or sitl: the vectorized simulator flies velocities and body rates"
+        )
     elif firmware == "ardupilot" and not kind.steady:
         accepted = "with firmware builtin or PX4: ArduPilot takes a thrust for a climb rate"
     else:

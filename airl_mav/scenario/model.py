@@ -23,7 +23,7 @@ from airl_mav.core.fields import (
 )
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import KINDS, UPRIGHT_S, DecisionTiming
-from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
+from airl_mav.scenario.aircraft import FREE, NOT_IN_GYM, Aircraft
 
 Place = tuple[
     Annotated[float, Field(ge=-90.0, le=90.0)],
@@ -41,7 +41,7 @@ ArenaName = Annotated[
 PolicyName = Annotated[
     str,
     Field(
-        description="policy that decides: a name, a path to a folder with policy.onnx and"
+        description="policy: a name, a path to a folder with policy.onnx and"
         " card.json, or a Python class as FILE.py:CLASS or MODULE:CLASS"
     ),
     COMMON,
@@ -124,42 +124,42 @@ class LimitSettings(ProfileModel):
     GROUP: ClassVar[str] = "limits"
 
     silence_s: float = quantity(
-        "telemetry that stays the same for longer, and frames that come later, are not believed",
+        "telemetry that stays the same for longer, and frames that come later, are rejected",
         "s",
         ge=0.5,
         le=60,
         default=2.0,
     )
     image_s: float = quantity(
-        "new frames that show the same image for longer are not believed",
+        "new frames that show the same image for longer are rejected",
         "s",
         ge=0.1,
         le=60,
         default=0.5,
     )
     radius_m: float | None = quantity(
-        "farthest from the start, level; by default twice the way to the goal and 50 m",
+        "maximum horizontal distance from the start; by default twice that of the goal plus 50 m",
         "m",
         gt=0,
         le=20_000,
         default=None,
     )
     height_m: float | None = quantity(
-        "highest above the start; by default 10 m above the altitude that is flown",
+        "maximum height above the start; by default 10 m above the flight altitude",
         "m",
         gt=0,
         le=1000,
         default=None,
     )
     flight_s: float | None = quantity(
-        "longest navigation; by default ten minutes, in a rehearsal its time limit",
+        "maximum navigation time; by default ten minutes, in a rehearsal its time limit",
         "s",
         ge=1,
         le=36_000,
         default=None,
     )
     battery: float | None = quantity(
-        "least charge of the battery, 1 is full; by default only the flight controller looks at it",
+        "minimum battery charge, 1 is full; by default only the flight controller checks it",
         "1",
         gt=0,
         lt=1,
@@ -218,7 +218,7 @@ class Decisions(Inference):
         default=None,
     )
     hold_s: float | None = quantity(
-        "t3: how long an action is held before the next observation; by default that of the"
+        "hold time (t3) of an action before the next observation; by default that of the"
         " policy's card, or 0.5",
         "s",
         ge=0,
@@ -236,7 +236,7 @@ class Decisions(Inference):
         "the goal is reached closer than this: seen from above, if it has no height; by"
         " default that of the policy's card, or 3"
     )
-    max_speed_m_s: Annotated[float | None, NO_TWIN] = quantity(
+    max_speed_m_s: Annotated[float | None, NOT_IN_GYM] = quantity(
         "horizontal speed limit of all actions; by default the fastest action of the policy's card,"
         " or 5",
         "m/s",
@@ -254,7 +254,7 @@ class Decisions(Inference):
         " decision is expected to act, by the vehicle's response to the setpoints in flight; by"
         " default as the policy's card says, or not"
     )
-    origin: Annotated[Place | None, NO_TWIN] = optional(
+    origin: Annotated[Place | None, NOT_IN_GYM] = optional(
         "where on the globe the flight begins: latitude, longitude (degrees), altitude"
         " above mean sea level (m). A flight controller without GPS is told it before it is armed,"
         " as it flies Hold only where it knows its place; by default, in a rehearsal without GPS,"
@@ -279,17 +279,17 @@ class Lateness(ProfileModel):
 
     computer: Annotated[str, COMMON] = Field(
         default="workstation",
-        description="computer profile to fly as: a shipped name, or a path to a .toml",
+        description="computer profile: a shipped name, or a path to a .toml",
     )
     workload: Annotated[str | None, COMMON] = optional(
-        "workload of the computer profile whose latency t2 is injected; estimate:"
+        "workload of the computer profile, for its decision latency (t2); estimate:"
         " scaled to this policy; by default what was measured for this very policy, or else what"
         " this machine takes (sitl) or 1 ms (gym, lockstep)"
     )
     latency: Annotated[str | None, COMMON] = optional(
-        "latency t2 to inject instead of the workload's: 150ms, lognormal:396ms,20ms"
-        " (mean, standard deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured"
-        " latencies, one a line in ms, which are replayed in order"
+        "decision latency (t2) to inject, in place of the workload's: 150ms, lognormal:396ms,20ms"
+        " (mean, standard deviation), COMPUTER/WORKLOAD, or a file with a latency [ms] per line;"
+        " also normal:396ms,20ms; a file is replayed in order"
     )
     latency_seed: int = _seed(
         "draws the same latency anew on the same episodes; 0: from the episodes' own seeds", 0
@@ -357,7 +357,7 @@ class Flights(Workers):
         " gym always begins in a hover",
     )
     time_limit_s: TimeLimit = TIME_LIMIT_S
-    speed: Annotated[float | None, FREE, NO_TWIN, Group("execution")] = quantity(
+    speed: Annotated[float | None, FREE, NOT_IN_GYM, Group("execution")] = quantity(
         "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"
         " to 1000 (default: as fast as it goes)",
         "1",

@@ -228,7 +228,10 @@ def test_what_ends_an_episode(tmp_path: Path) -> None:
         ({"firmware": "px5"}, "firmware 'px5': accepted: .*'px4'"),
         ({"firmware": "ardupilot"}, "firmware"),
         ({"render_mode": "ansi"}, "render_mode = 'ansi': accepted: None, rgb_array, human"),
-        ({"curriculum": {}}, "curriculum .*: accepted: None: only the batch twin has another"),
+        (
+            {"curriculum": {}},
+            "curriculum .*: accepted: None: only the vectorized simulator has another",
+        ),
         ({"delay": {"link_ms": 9}}, r"delay\.link_ms 9: accepted: 4"),
         ({"goal_height": True}, "goal_height True: accepted: false in arena"),
         ({"faults": ["gps off at noon"]}, "faults"),

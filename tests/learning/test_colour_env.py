@@ -102,7 +102,7 @@ def test_the_image_is_that_of_the_one_caster(kind: CameraKind, projection: Proje
     assert len(np.unique(env.cameras.image)) > 50
 
 
-# Stuck depth cameras: test_twin_faults.py. Colour compiles a separate renderer.
+# Stuck depth cameras: test_gym_faults.py. Colour compiles a separate renderer.
 @pytest.mark.nightly
 def test_a_camera_that_is_stuck_shows_the_same_picture() -> None:
     (stuck,) = Scenario(faults=("camera stuck at offboard+1s",)).faults

@@ -111,6 +111,6 @@ def test_a_mosaic_is_refused_where_training_makes_the_camera_grey(tmp_path: Path
 
 
 def test_a_gain_that_takes_time_is_refused_in_the_twin(tmp_path: Path) -> None:
-    told = r"time_constant_s.*0.3.*0 in the batch twin"
+    told = r"time_constant_s.*0.3.*0 in the vectorized simulator"
     with pytest.raises(FieldError, match=told):
         flown(tmp_path, "[camera.imaging.auto_exposure]\n")

@@ -18,7 +18,7 @@ def airl(name: str, *words: str, width: int | None = None) -> tuple[int, str]:
     out = io.StringIO()
     console = new_console(file=out, width=width or 200, soft_wrap=width is None)
     code = carry_out(
-        f"airl {name}", subcommands()[name.replace("_", "-")][1], words, console=console
+        f"airl {name}", subcommands()[name.replace("_", "-")][2], words, console=console
     )
     return code, out.getvalue()
 

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import difflib
+import importlib
 import subprocess
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
+import tyro
 
 from airl_mav import __version__
 from airl_mav.cli import main as entry
+from airl_mav.cli.help_texts import options_in
 from airl_mav.cli.list_command import KINDS
-from airl_mav.cli.main import main, subcommands
+from airl_mav.cli.main import GROUPS, main, subcommands
+from airl_mav.cli.options import _arguments
+from airl_mav.core import fields
 from airl_mav.core.unsupported import PAGE
 from airl_mav.policy.registry import policy_names
 from airl_mav.profiles.loading import list_profiles
 from tests.support.processes import ROOT
 
-OLD = ("profile",)
-"""Subcommands whose modules do not have their options as a model yet."""
-
-NAMES = [name for name in subcommands() if name not in OLD]
+NAMES = list(subcommands())
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
@@ -107,6 +109,49 @@ def test_help_has_examples_that_can_be_typed(
     assert "Examples:" in lines
     examples = lines[lines.index("Examples:") + 1 :]
     assert any(line.startswith((f"airl {name}", f"airl-{name}")) for line in examples)
+
+
+def test_the_commands_fit_on_a_page(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = run(capsys, "--help")
+    assert len(out.splitlines()) <= 40
+    assert max(map(len, out.splitlines())) <= 80
+    assert {group for group, _, _ in subcommands().values()} == set(GROUPS)
+
+
+@pytest.mark.filterwarnings("ignore:get_parser")
+@pytest.mark.parametrize("name", NAMES)
+def test_help_is_short_and_help_all_complete(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _, short, _ = run(capsys, name, "--help")
+    assert len(short.splitlines()) <= 60
+    _, full, _ = run(capsys, name, "--help-all")
+    model = importlib.import_module(subcommands()[name][2]).OPTIONS
+    kind: Any = Annotated[(_arguments(model, {}), tyro.conf.HelptextFromCommentsOff)]
+    parser = tyro.extras.get_parser(kind)
+    expected = {option for action in parser._actions for option in action.option_strings}
+    expected = {option for option in expected if not option.startswith("--no-")} - {"-h", "--help"}
+    shown = {line.split()[0].rstrip(",") for line in full.splitlines() if line.startswith("  --")}
+    assert shown == expected
+    options = list(options_in(model))
+    assert {each.group for each in options} <= set(fields.GROUPS)
+    assert all(each.meaning.strip(". ") for each in options)
+    common = [each.usage.split()[0] for each in options if each.is_common]
+    assert all(f"\n  {option}" in short for option in common)
+
+
+@pytest.mark.parametrize("name", ["sitl", "evaluate"])
+def test_help_starts_with_policy_and_episodes(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, out, _ = run(capsys, name, "--help")
+    first = out.partition("Options:\n")[2].splitlines()
+    shown = [line.split()[0] for line in first if line[2:3] not in ("", " ")]
+    assert shown[:2] in (["--policy", "--episodes"], ["[POLICY", "--episodes"])
 
 
 @pytest.mark.parametrize("name", ["sitl", "firmware", "companion"])

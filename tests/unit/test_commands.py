@@ -220,7 +220,9 @@ def test_what_cannot_be_flown_by_body_rates_or_attitude_is_refused() -> None:
     rates = find_policy(RATES)
     leaning = find_policy(f"{__name__}:Leaning")
     assert leaning.commands == "attitude"
-    with pytest.raises(FieldError, match="at level lockstep or sitl: the batch twin flies"):
+    with pytest.raises(
+        FieldError, match="at level lockstep or sitl: the vectorized simulator flies"
+    ):
         check_commands(leaning, "Leaning", level="gym")
     check_commands(rates, "ToGoal", level="gym")
     for policy in (rates, leaning):

@@ -19,7 +19,7 @@ from airl_mav.core.streams import Stream, stream, words_of
 from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.registry import PolicyInfo, camera_refused
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera, check_noise, check_renderer, check_twin_imaging
+from airl_mav.profiles.camera import Camera, check_gym_imaging, check_noise, check_renderer
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
@@ -204,7 +204,7 @@ def test_conditions_of_depth_are_refused_where_no_camera_gives_any() -> None:
 def test_a_gain_that_takes_time_names_its_camera() -> None:
     table = {**GREY.model_dump(), "imaging": {"auto_exposure": {"time_constant_s": 0.3}}}
     with pytest.raises(FieldError, match=r"cameras\.down\.imaging\.auto_exposure\.time_const"):
-        check_twin_imaging(Camera.model_validate(table), "down")
+        check_gym_imaging(Camera.model_validate(table), "down")
 
 
 def test_what_takes_the_main_camera_to_look_ahead_is_refused_where_it_does_not() -> None:

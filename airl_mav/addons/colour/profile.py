@@ -322,7 +322,7 @@ class AutoExposure(ProfileModel):
     )
     time_constant_s: float = quantity(
         "time in which it covers 63 % of the way to the gain that is due; 0: it is there at once,"
-        " which is all that the batch twin has",
+        " which is all that the vectorized simulator has",
         "s",
         ge=0,
         le=10,

@@ -5,10 +5,10 @@ flies the learner for a growing share of decisions, and labels the visited state
 actions (Ross, Gordon, Bagnell, AISTATS 2011, arXiv 1011.0686). Behaviour cloning is DAgger with the
 expert always in control.
 
-Experts decide for the flights of a batch twin, in its action set. `greedy` is the classical
-baseline with the policy's observations. `planner` uses the true arena, `gates` the true openings of
-its gates and computes its own actions (`GatePilot`). The others choose among commands of the action
-set: all of a discrete set, or a fan of directions and speeds of the continuous set.
+Experts decide for the flights of a vectorized simulator, in its action set. `greedy` is the
+classical baseline with the policy's observations. `planner` uses the true arena, `gates` the true
+openings of its gates and computes its own actions (`GatePilot`). The others choose among commands
+of the action set: all of a discrete set, or a fan of directions and speeds of the continuous set.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ NOWHERE = 1e6
 
 
 class GatePilot:
-    """Pilot through gates for the flights of a batch twin."""
+    """Pilot through gates for the flights of a vectorized simulator."""
 
     def __init__(self, navigation: Navigation) -> None:
         """Store the flights.
@@ -373,7 +373,7 @@ def choices(spec: ActionSpec) -> Choices:
 
 
 class Chooser(Protocol):
-    """Interface of experts: decide for the flights of a batch twin."""
+    """Interface of experts: decide for the flights of a vectorized simulator."""
 
     def begin(self, slots: Sequence[int]) -> None:
         """Start episodes in slots."""
@@ -418,7 +418,7 @@ class StatefulExpert(sb3.Expert):
     """Expert and its memory, with checkpoint support."""
 
     def __init__(self, name: ExpertName, navigation: Navigation) -> None:
-        """Create an expert by name, for the flights of a batch twin."""
+        """Create an expert by name, for the flights of a vectorized simulator."""
         self._navigation = navigation
         self._chooser: Planner | GreedyPilots | GatePilot
         self._choices: Choices | None = None

@@ -1,7 +1,7 @@
 """Planner: an expert that uses the true arena, including the tours of moving obstacles.
 
-Only the batch twin provides this information. The planner is a teacher for imitation learning
-(`addons.imitation`), not a flight policy.
+Only the vectorized simulator provides this information. The planner is a teacher for imitation
+learning (`addons.imitation`), not a flight policy.
 
 At the start of an episode it computes a map of the time to the goal (`Map`). A decision evaluates
 actions of the set: each is simulated with the vehicle profile's response, to the end of its hold,
@@ -307,7 +307,7 @@ class PlannerTiming(NamedTuple):
 
 
 class Planner:
-    """Planner for the flights of a batch twin. Implements `imitation.Chooser`."""
+    """Planner for the flights of a vectorized simulator. Implements `imitation.Chooser`."""
 
     def __init__(self, navigation: Navigation, commands: NDArray[np.float64]) -> None:
         """Store the flights and the candidate commands (c, 3).

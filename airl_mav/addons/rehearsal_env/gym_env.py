@@ -61,7 +61,7 @@ BESIDE = (
 )
 """Fields of a `Scenario` that an `EnvironmentSpec` lacks."""
 
-TWIN_ALONE = (
+GYM_ALONE = (
     "camera",
     "curriculum",
     "delay.native_ms",
@@ -85,10 +85,10 @@ def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
     """
     # Settings that only the vectorized simulator supports must have their default.
     usual = EnvironmentSpec()
-    for name in TWIN_ALONE:
+    for name in GYM_ALONE:
         value, accepted = (reduce(getattr, name.split("."), each) for each in (spec, usual))
         if value != accepted:
-            raise FieldError(name, value, f"{accepted}: only the batch twin has another")
+            raise FieldError(name, value, f"{accepted}: only the vectorized simulator has another")
     rules, delay, drawn = spec.episode, spec.delay, spec.randomisation
     return Scenario(
         level="lockstep",

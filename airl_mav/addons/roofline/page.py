@@ -221,7 +221,7 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
     fleet, arenas, shared = (
         new_fleet(n),
         stopping.open_space(n, obstacles=1),
-        stopping.twin_of(vehicle),
+        stopping.gym_constants_of(vehicle),
     )
     for i in range(n):
         hover(fleet, i, stopping.ALTITUDE_M, shared)

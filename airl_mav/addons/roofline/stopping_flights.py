@@ -57,7 +57,7 @@ def fly_into(
     others = [np.random.default_rng((seed + i, draws)) for i in range(draws)]
     phases = np.array([rng.random(2) for rng in others])
     reaction_us = _reactions_us(task.loop, samplers, phases[:, 0])
-    shared = stopping.twin_of(task.vehicle)
+    shared = stopping.gym_constants_of(task.vehicle)
     moments = (phases[:, 1] * len(stopping.MOMENTS_S)).astype(np.int64)
     flying = stopping.run_ups(shared, [speed_m_s], stopping.MOMENTS_S)
     fleet = Fleet._make(array[moments] for array in flying)

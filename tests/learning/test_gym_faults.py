@@ -13,13 +13,13 @@ from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.decision import frame_age_us
 from airl_mav.envs.draws import Winds
 from airl_mav.envs.evaluation import Trace
-from airl_mav.envs.faults import gusts, twin_faults
+from airl_mav.envs.faults import gusts, gym_faults
 from airl_mav.envs.fleet import hover, new_fleet
 from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.experiments.gym_flier import GymFlier
-from airl_mav.faults import Fault, check_twin
+from airl_mav.faults import Fault, check_gym
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft
@@ -76,7 +76,7 @@ def test_twin_and_plant_fly_through_the_same_gust() -> None:
 
 
 def test_a_gust_rises_and_falls_as_one_minus_the_cosine() -> None:
-    (gust,) = twin_faults([fault("wind gust 6,0,0m/s at offboard+1s for 4s")], "wind")
+    (gust,) = gym_faults([fault("wind gust 6,0,0m/s at offboard+1s for 4s")], "wind")
     north = gusts([gust], 0, 1500)[:, 0]
     time_s = TICK_US / US_PER_S * np.arange(1500)
     inside = (time_s >= 1.0) & (time_s < 5.0)
@@ -198,9 +198,9 @@ def test_what_the_twin_cannot_fly_is_refused(words: str, accepted: str) -> None:
 def test_delays_that_no_decision_of_the_twin_waits_for_are_refused() -> None:
     late = [fault("camera delay 100ms at offboard")]
     with pytest.raises(FieldError, match="with decisions sequential"):
-        check_twin(late, pipelined=True)
+        check_gym(late, pipelined=True)
     with pytest.raises(FieldError, match="one delay of the camera"):
-        check_twin(late * 2)
+        check_gym(late * 2)
     with pytest.raises(UsageError, match="what faults delay"):
         navigation("camera delay 600ms at offboard")
 
