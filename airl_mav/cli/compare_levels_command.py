@@ -10,7 +10,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.core.fields import COMMON, Group, quantity
+from airl_mav.core.fields import COMMON, quantity
 from airl_mav.experiments.evaluate import LEVELS, declare_compare_levels, training_arena
 from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import LevelName
@@ -30,15 +30,15 @@ class CompareLevelsOptions(ExperimentOptions):
     policy: Annotated[str, POSITIONAL] = Field(
         description="a name, or a path to a folder with policy.onnx and card.json"
     )
-    arena: Annotated[str | None, COMMON, Group("arena")] = Field(
+    arena: Annotated[str | None, COMMON, "arena"] = Field(
         default=None,
         description="arena profile; by default that which the policy was trained in",
     )
     episodes: int = episodes("episodes at each level", 100)
-    levels: Annotated[tuple[LevelName, ...], COMMON, Group("execution")] = Field(
+    levels: Annotated[tuple[LevelName, ...], COMMON, "execution"] = Field(
         default=LEVELS, description="levels that fly, two or more; the first is the reference"
     )
-    sitl_episodes: Annotated[int | None, COMMON, Group("execution")] = quantity(
+    sitl_episodes: Annotated[int | None, COMMON, "execution"] = quantity(
         "episodes at level sitl, which flies in real time times the speed: the first ones of the"
         " seeds; by default 10, or all if they are fewer",
         "1",
@@ -46,7 +46,7 @@ class CompareLevelsOptions(ExperimentOptions):
         le=100_000,
         default=None,
     )
-    out: Annotated[Path | None, COMMON, Group("output")] = Field(
+    out: Annotated[Path | None, COMMON, "output"] = Field(
         default=None,
         description="folder of the comparison: a run folder for each level, compare-levels.json and"
         " compare-levels.html; by default runs/<UTC time>-compare-levels-<policy>-<arena>",

@@ -40,7 +40,6 @@ class OnboardOptions(Gate, ExperimentOptions):
     """Options for a policy on an onboard computer, compared with a reference."""
 
     GROUP: ClassVar[str] = "latency"
-
     computer: str = Field(
         default=model.ONBOARD_COMPUTER,
         description="onboard computer: a shipped profile, or a path to a .toml",

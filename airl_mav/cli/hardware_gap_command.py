@@ -10,7 +10,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import OnboardOptions, episodes, fly_and_show
 from airl_mav.cli.options import scenario_of
-from airl_mav.core.fields import COMMON, Group
+from airl_mav.core.fields import COMMON
 from airl_mav.experiments.hardware_gap import (
     DEFAULT_MITIGATED,
     DEFAULT_UNMITIGATED,
@@ -34,23 +34,23 @@ class HardwareGapOptions(OnboardOptions):
         airl hardware-gap --level lockstep --episodes 500
     """
 
-    policy: Annotated[str, COMMON, Group("policy")] = Field(
+    policy: Annotated[str, COMMON, "policy"] = Field(
         default=DEFAULT_UNMITIGATED,
         description="policy without mitigation: a name, or a path to a folder with policy.onnx and"
         " card.json",
     )
-    mitigated: Annotated[str, COMMON, Group("policy")] = Field(
+    mitigated: Annotated[str, COMMON, "policy"] = Field(
         default=DEFAULT_MITIGATED,
         description="policy trained with the computer's latency: a name, or a path; none: only"
         " fly without mitigation",
     )
-    arena: Annotated[tuple[str, ...], COMMON, Group("arena")] = Field(
+    arena: Annotated[tuple[str, ...], COMMON, "arena"] = Field(
         default=(DEFAULT_ARENA,),
         min_length=1,
         description="arena profiles: shipped names, or paths; of several, each gets its tables",
     )
     episodes: int = episodes("episodes of each policy on each computer in each arena", 1000)
-    out: Annotated[Path | None, COMMON, Group("output")] = Field(
+    out: Annotated[Path | None, COMMON, "output"] = Field(
         default=None,
         description="folder of the comparison: a run folder for each policy on each computer,"
         " hardware-gap.json, .md and .html; by default"

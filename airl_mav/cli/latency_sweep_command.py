@@ -11,7 +11,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.cli.shared_options import Gate
-from airl_mav.core.fields import COMMON, Group
+from airl_mav.core.fields import COMMON
 from airl_mav.experiments.evaluate import LATENCIES, declare_latency_sweep
 from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY, ArenaName
 
@@ -32,18 +32,18 @@ class LatencySweepOptions(Gate, ExperimentOptions):
         default=(DEFAULT_POLICY,),
         description="names, or paths to folders with policy.onnx and card.json",
     )
-    latencies: Annotated[tuple[str, ...], COMMON, Group("latency")] = Field(
+    latencies: Annotated[tuple[str, ...], COMMON, "latency"] = Field(
         default=LATENCIES,
         description="sources of t2 as latency takes them, growing; native: none injected; the first"
         " is the reference",
     )
-    compensated: Annotated[bool, COMMON, Group("latency")] = Field(
+    compensated: Annotated[bool, COMMON, "latency"] = Field(
         default=False,
         description="also fly each policy with compensated latency, as a separate curve",
     )
     arena: ArenaName = DEFAULT_ARENA
     episodes: int = episodes("episodes at each latency", 300)
-    out: Annotated[Path | None, COMMON, Group("output")] = Field(
+    out: Annotated[Path | None, COMMON, "output"] = Field(
         default=None,
         description="folder of the curve: a run folder for each latency, latency-sweep.json and"
         " latency-sweep.html; by default runs/<UTC time>-latency-sweep-<policies>",

@@ -38,7 +38,6 @@ class Gate(ProfileModel):
     """Requirements, and files for the verdict."""
 
     GROUP: ClassVar[str] = "requirements"
-
     require: Annotated[tuple[str, ...], REPEATED, COMMON] = Field(
         default=(),
         description="requirement, decided on the 95 % interval, as 'success >= 95 %'; may be"
@@ -84,7 +83,6 @@ class Viewing(ProfileModel):
     """Live view of flights."""
 
     GROUP: ClassVar[str] = "output"
-
     view: Annotated[bool, COMMON] = Field(
         default=False,
         description="show the flights in a browser while they fly, at an address that is printed"
@@ -132,7 +130,6 @@ class Telling(ProfileModel):
     """Output mode of a command."""
 
     GROUP: ClassVar[str] = "output"
-
     quiet: bool = Field(
         default=False,
         description="print nothing but the result: the verdict and the path of the report or run"

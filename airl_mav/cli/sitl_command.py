@@ -18,7 +18,7 @@ from airl_mav.cli.options import check_installed, run_command, scenario_of
 from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import COMMON, Group
+from airl_mav.core.fields import COMMON
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.projections import SLOW
 from airl_mav.rehearsal.host_pace import host_problem
@@ -45,19 +45,19 @@ class SitlOptions(shared_options.Gate, shared_options.Viewing, shared_options.Te
         airl-sitl rehearsal.toml --latency 150ms --require "success >= 90 %"
     """
 
-    out: Annotated[Path | None, COMMON, Group("output")] = Field(
+    out: Annotated[Path | None, COMMON, "output"] = Field(
         default=None,
         description="run folder; an incomplete folder of the same run is completed; default:"
         " runs/<UTC time>-<level>-<policy>",
     )
 
-    video: Annotated[str | None, Group("output")] = Field(
+    video: Annotated[str | None, "output"] = Field(
         default=None,
         description="show what the camera sees as a video, to HOST:PORT; 127.0.0.1:5600 is where"
         " QGroundControl on this machine listens",
     )
 
-    tables: Annotated[bool, COMMON, Group("output")] = Field(
+    tables: Annotated[bool, COMMON, "output"] = Field(
         default=False, description="print the tables of the report before the verdict"
     )
 

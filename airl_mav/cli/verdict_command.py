@@ -11,7 +11,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import OnboardOptions, episodes
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
 from airl_mav.cli.shared_options import Gate, Voice, leave, requirements_of
-from airl_mav.core.fields import COMMON, Group
+from airl_mav.core.fields import COMMON
 from airl_mav.experiments.hardware_gap import seek_verdict
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.flight.requirements import LOOKS
@@ -51,7 +51,7 @@ class VerdictOptions(OnboardOptions):
         500,
         LOOKS[0],
     )
-    out: Annotated[Path | None, COMMON, Group("output")] = Field(
+    out: Annotated[Path | None, COMMON, "output"] = Field(
         default=None,
         description="folder: two run folders, hardware-gap.html and verdict.json; by default"
         " runs/<UTC time>-verdict-<policy>-<computer>",

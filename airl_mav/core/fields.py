@@ -61,28 +61,10 @@ COMMON = "most used"
 """Marks an option of `--help`; `--help-all` shows all options."""
 
 GROUPS = (
-    "options",
-    "policy",
-    "episodes",
-    "arena",
-    "latency",
-    "aircraft",
-    "domain randomization",
-    "sensors",
-    "firmware and links",
-    "execution",
-    "limits",
-    "requirements",
-    "output",
+    *("options", "policy", "episodes", "arena", "latency", "aircraft", "domain randomization"),
+    *("sensors", "firmware and links", "execution", "limits", "requirements", "output"),
 )
-"""Groups of options in `--help-all`, in order. A model names the group of its fields as `GROUP`."""
-
-
-@dataclass(frozen=True)
-class Group:
-    """Marks an option with another group than its model's."""
-
-    name: str
+"""Groups of `--help-all`, in order: the attribute `GROUP` of a model, or a mark of a field."""
 
 
 class ProfileModel(BaseModel):

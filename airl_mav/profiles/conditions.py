@@ -55,7 +55,6 @@ class Spread(ProfileModel):
     """
 
     GROUP: ClassVar[str] = "domain randomization"
-
     mass: float = quantity("mass and inertia, +- this share", "1", ge=0, le=0.9, default=0.0)
     thrust: float = quantity("greatest thrust, +- this share", "1", ge=0, le=0.9, default=0.0)
     drag: float = quantity("drag, +- this share", "1", ge=0, le=0.9, default=0.0)
@@ -68,7 +67,6 @@ class SensorNoise(ProfileModel):
     """Scale of sensor noise relative to the profile."""
 
     GROUP: ClassVar[str] = "sensors"
-
     navigation_noise: float = quantity(
         "noise, bias and drift of IMU, GPS, barometer and magnetometer, times this; where the"
         " estimator is a model of its error, that error. The estimator keeps its nominal settings",

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from airl_mav.core.fields import COMMON, Group, ProfileModel, optional, quantity, switch
+from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switch
 from airl_mav.faults import Fault
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projections import Renderer
@@ -61,7 +61,6 @@ class Ports(ProfileModel):
     """UDP ports of the MAVLink links, as in PX4 SITL, and the camera's TCP port."""
 
     GROUP: ClassVar[str] = "firmware and links"
-
     api_port: int = _port("UDP port of the onboard API, where MAVSDK listens", 14540)
     api_local_port: int = _port(
         "UDP port that the flight controller's onboard link binds; 0: any free one", 14580
@@ -80,7 +79,6 @@ class RealFirmware(ProfileModel):
     """Real firmware: start settings, or the connection to a firmware started by the user."""
 
     GROUP: ClassVar[str] = "firmware and links"
-
     px4_dir: Path | None = optional(
         "with firmware px4: start this PX4 for every flight; a SITL build, its source"
         " tree, or an unpacked package"
@@ -129,7 +127,6 @@ class Aircraft(ProfileModel):
     """Aircraft and its connections."""
 
     GROUP: ClassVar[str] = "aircraft"
-
     vehicle: VehicleName = DEFAULT_VEHICLE
     payload: Payload = Field(default_factory=Payload, description="payload")
     battery_charge: float = quantity(
@@ -143,7 +140,7 @@ class Aircraft(ProfileModel):
         description="faults that happen in every flight, in words: gps off at 8s for 5s; see"
         " docs/how-to/faults.md",
     )
-    estimator: Annotated[EstimatorName, NOT_IN_GYM, Group("sensors")] = Field(
+    estimator: Annotated[EstimatorName, NOT_IN_GYM, "sensors"] = Field(
         default="kernel",
         description="filter of the state estimator: the compiled one, or filterpy's, its reference,"
         " some twenty times slower",
@@ -153,19 +150,19 @@ class Aircraft(ProfileModel):
         description="physics engine: pybullet, or the vectorized simulator's compiled rigid body"
         " (default without pybullet); not at level gym",
     )
-    renderer: Annotated[Renderer, Group("sensors")] = Field(
+    renderer: Annotated[Renderer, "sensors"] = Field(
         default="raycast",
         description="renderer of a colour camera: the ray caster, or Mitsuba's path tracer, a"
         " hundred times slower: level lockstep waits for it, level sitl gets fewer and later"
         " images; level gym does not support it",
     )
-    firmware: Annotated[FirmwareName, COMMON, Group("firmware and links")] = Field(
+    firmware: Annotated[FirmwareName, COMMON, "firmware and links"] = Field(
         default="builtin",
         description="flight controller: the built-in one, or real firmware on this vehicle and its"
         " sensors; see docs/how-to/real-firmware.md",
     )
     real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
-    signing_key: Annotated[Path | None, FREE, Group("firmware and links")] = optional(
+    signing_key: Annotated[Path | None, FREE, "firmware and links"] = optional(
         "sign MAVLink with the key in this file (64 hexadecimal digits, mode 0600), and"
         " refuse what is not signed with it"
     )

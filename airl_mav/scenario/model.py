@@ -12,15 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from airl_mav.core.constants import CommandKind
-from airl_mav.core.fields import (
-    COMMON,
-    Group,
-    ProfileModel,
-    field_error,
-    optional,
-    quantity,
-    switch,
-)
+from airl_mav.core.fields import COMMON, ProfileModel, field_error, optional, quantity, switch
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import KINDS, UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NOT_IN_GYM, Aircraft
@@ -33,10 +25,7 @@ Place = tuple[
 """Latitude, longitude [deg], altitude above mean sea level [m]; PX4's limits for an origin."""
 
 ArenaName = Annotated[
-    str,
-    Field(description="arena profile: a shipped name, or a path to a .toml"),
-    COMMON,
-    Group("arena"),
+    str, Field(description="arena profile: a shipped name, or a path to a .toml"), COMMON, "arena"
 ]
 PolicyName = Annotated[
     str,
@@ -45,7 +34,7 @@ PolicyName = Annotated[
         " card.json, or a Python class as FILE.py:CLASS or MODULE:CLASS"
     ),
     COMMON,
-    Group("policy"),
+    "policy",
 ]
 
 DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles-fast", "static-obstacles"
@@ -77,7 +66,6 @@ class WatchdogSettings(ProfileModel):
     """Timeouts for a silent policy, in simulated time."""
 
     GROUP: ClassVar[str] = "limits"
-
     decision_timeout_s: float | None = quantity(
         "time since the last action after which the velocity is zeroed; longer than the hold time;"
         f" by default as the policy's card says, or {DECISION_TIMEOUT_S:g}, and {UPRIGHT_S:g}"
@@ -122,7 +110,6 @@ class LimitSettings(ProfileModel):
     """Limits on telemetry, camera and flight; a violation ends the flight."""
 
     GROUP: ClassVar[str] = "limits"
-
     silence_s: float = quantity(
         "telemetry that stays the same for longer, and frames that come later, are rejected",
         "s",
@@ -193,7 +180,6 @@ class Inference(ProfileModel):
     """Settings of network inference."""
 
     GROUP: ClassVar[str] = "policy"
-
     runtime: RuntimeName = Field(
         default="onnx", description="runtime of a learned policy; torch needs its policy.pt2"
     )
@@ -208,7 +194,6 @@ class Decisions(Inference):
     """Policy settings and flight settings of its actions."""
 
     GROUP: ClassVar[str] = "policy"
-
     cpu_quota: float | None = quantity(
         "hold the companion to this share of one core, for real, by a Linux control group; what it"
         " then takes is measured, nothing is injected",
@@ -249,7 +234,7 @@ class Decisions(Inference):
         " with the newest frame as soon as the one before is ready; by default as the policy's card"
         " says, or sequential"
     )
-    compensate: Annotated[bool | None, Group("latency")] = optional(
+    compensate: Annotated[bool | None, "latency"] = optional(
         "compensate the latency: state and depth image are carried forward to when the"
         " decision is expected to act, by the vehicle's response to the setpoints in flight; by"
         " default as the policy's card says, or not"
@@ -276,7 +261,6 @@ class Lateness(ProfileModel):
     """Decision latency t2, in simulated time."""
 
     GROUP: ClassVar[str] = "latency"
-
     computer: Annotated[str, COMMON] = Field(
         default="workstation",
         description="computer profile: a shipped name, or a path to a .toml",
@@ -300,7 +284,6 @@ class Workers(ProfileModel):
     """Execution of an experiment's jobs; has no effect on results."""
 
     GROUP: ClassVar[str] = "execution"
-
     executor: Annotated[Literal["process", "ray"], FREE] = Field(
         default="process",
         description="executor of the jobs: processes of this machine, or a Ray cluster",
@@ -324,8 +307,7 @@ class Flights(Workers):
     """Episodes of a run and their execution."""
 
     GROUP: ClassVar[str] = "episodes"
-
-    level: Annotated[LevelName, COMMON, Group("execution")] = Field(
+    level: Annotated[LevelName, COMMON, "execution"] = Field(
         default="sitl",
         description="fidelity level. gym: the vectorized simulator, some hundred episodes a"
         " second. lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the"
@@ -335,14 +317,12 @@ class Flights(Workers):
     episodes: Annotated[int, COMMON] = quantity(
         "number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3
     )
-    seed: Annotated[int, COMMON] = _seed(
-        "episode i uses seed + i for arena, sensors, wind, spread and latency"
-    )
-    arena_seed: Annotated[int | None, Group("arena")] = _seed(
+    seed: Annotated[int, COMMON] = _seed("random seed; episode i uses seed + i for everything")
+    arena_seed: Annotated[int | None, "arena"] = _seed(
         "every episode in the arena, and with the goal, of this one seed; by default of its own",
         None,
     )
-    zone: Annotated[int | None, Group("arena")] = quantity(
+    zone: Annotated[int | None, "arena"] = quantity(
         "curriculum zone of the arena that every goal is drawn in: 0 is the smallest, around the"
         " start; by default the largest, the whole arena",
         "1",
@@ -357,7 +337,7 @@ class Flights(Workers):
         " gym always begins in a hover",
     )
     time_limit_s: TimeLimit = TIME_LIMIT_S
-    speed: Annotated[float | None, FREE, NOT_IN_GYM, Group("execution")] = quantity(
+    speed: Annotated[float | None, FREE, NOT_IN_GYM, "execution"] = quantity(
         "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"
         " to 1000 (default: as fast as it goes)",
         "1",
@@ -370,14 +350,14 @@ class Flights(Workers):
         description="level sitl: fly again what the host disturbed, as it is no test of the policy;"
         " without, every flight counts, and the report says so",
     )
-    slots: Annotated[int, FREE, Group("execution")] = quantity(
+    slots: Annotated[int, FREE, "execution"] = quantity(
         "level gym: flights at a time; decides the pace, not the results",
         "1",
         ge=1,
         le=GREATEST_SLOTS,
         default=128,
     )
-    tlogs: Annotated[bool, FREE, Group("output")] = switch(
+    tlogs: Annotated[bool, FREE, "output"] = switch(
         "level lockstep: write the logs of every flight (.tlog, .ulg); level sitl always does"
     )
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from airl_mav.core.constants import LOOPBACK, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import COMMON, Group, ProfileModel, optional, quantity, switch
+from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switch
 from airl_mav.core.frames import Goal
 from airl_mav.faults import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
@@ -41,9 +41,8 @@ class StandAloneVehicle(Aircraft):
     """Flight controller, vehicle and camera without a companion, for any client."""
 
     GROUP: ClassVar[str] = "execution"
-
     arena: model.ArenaName = model.DEFAULT_ARENA
-    computer: Annotated[str, COMMON, Group("aircraft")] = Field(
+    computer: Annotated[str, COMMON, "aircraft"] = Field(
         default="workstation",
         description="computer profile that is on board, for its mass and its power: a shipped name,"
         " or a path to a .toml",
@@ -61,16 +60,16 @@ class StandAloneVehicle(Aircraft):
     firmware_log: Path | None = optional(
         "with real firmware that is started here: what it prints goes to this file"
     )
-    bind: Annotated[str, Group("firmware and links")] = Field(
+    bind: Annotated[str, "firmware and links"] = Field(
         default=LOOPBACK, description="IPv4 address that links and camera bind"
     )
-    companion_host: Annotated[str, Group("firmware and links")] = Field(
+    companion_host: Annotated[str, "firmware and links"] = Field(
         default=LOOPBACK, description="IPv4 address of the companion computer"
     )
-    gcs_host: Annotated[str, Group("firmware and links")] = Field(
+    gcs_host: Annotated[str, "firmware and links"] = Field(
         default=LOOPBACK, description="IPv4 address of the ground station"
     )
-    insecure: Annotated[bool, Group("firmware and links")] = switch(
+    insecure: Annotated[bool, "firmware and links"] = switch(
         "allow addresses that other machines can reach without a signing key: MAVLink"
         " has no other authentication"
     )
@@ -115,7 +114,7 @@ class StandAloneVehicle(Aircraft):
         "keep the parameters that clients set in this file: read at the start, written"
         " after every change; QGroundControl loads it, too"
     )
-    tlog: Annotated[Path | None, COMMON, Group("output")] = optional(
+    tlog: Annotated[Path | None, COMMON, "output"] = optional(
         "write the MAVLink log of the onboard link to this file, and the vehicle's log"
         " (.ulg) beside it"
     )
@@ -147,7 +146,6 @@ class CompanionAddresses(ProfileModel):
     """Connections of a stand-alone companion to flight controller and camera."""
 
     GROUP: ClassVar[str] = "firmware and links"
-
     connect: Annotated[str, COMMON] = Field(
         default="udpin://127.0.0.1:14540",
         description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
@@ -160,7 +158,6 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
     """Stand-alone companion that flies a policy, onboard or against any simulator."""
 
     GROUP: ClassVar[str] = "execution"
-
     signing_key: Path | None = optional(
         "sign MAVLink with the key in this file, that of the flight controller (64"
         " hexadecimal digits, mode 0600); over udpin:// only"
@@ -177,7 +174,7 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
         " takes off and hands over in flight by switching to Offboard (ArduPilot: GUIDED); the"
         " companion gives the vehicle back in Hold and never arms or lands it",
     )
-    vehicle: Annotated[str, COMMON, Group("aircraft")] = Field(
+    vehicle: Annotated[str, COMMON, "aircraft"] = Field(
         default="quad",
         description="vehicle profile: compensation uses its response to setpoints and its camera's"
         " mount",
@@ -211,10 +208,10 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
         le=3600,
         default=30.0,
     )
-    log: Annotated[Path | None, Group("output")] = optional(
+    log: Annotated[Path | None, "output"] = optional(
         "write the stamps of every decision to this .npz file"
     )
-    black_box: Annotated[Path | None, COMMON, Group("output")] = optional(
+    black_box: Annotated[Path | None, COMMON, "output"] = optional(
         "record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
         " telemetry, images, status and resources; it survives a crash up to its last second, and"
         " airl report shows it"
@@ -224,7 +221,7 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
         " flight controller's collision prevention (CP_DIST), which holds back a pilot in Position"
         " mode"
     )
-    black_box_images_hz: Annotated[float, Group("output")] = quantity(
+    black_box_images_hz: Annotated[float, "output"] = quantity(
         "most images that the black box keeps, each one that a decision saw",
         "Hz",
         ge=0,

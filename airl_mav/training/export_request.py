@@ -127,9 +127,9 @@ DEFAULTS: dict[str, Any] = {
 class ModelProperties(NamedTuple):
     """Properties read from a model: its images, and its action set."""
 
-    image: Annotated[str | None, COMMON] = None
+    image: str | None = None
     frames: int | None = None
-    actions: Annotated[ActionSetName | None, COMMON] = None
+    actions: ActionSetName | None = None
     kind: CameraKind | None = None
     goal_height: bool | None = None
 
@@ -165,7 +165,7 @@ class ExportRequest(BaseModel):
     layout: Annotated[LayoutName | None, COMMON] = optional(
         "observation layout that the model was trained with; by default body"
     )
-    image: str | None = optional(
+    image: Annotated[str | None, COMMON] = optional(
         "width x height of the image that the network sees, px; `paper`: with its"
         " strip; by default as the .zip says, or 32x24"
     )
@@ -187,7 +187,7 @@ class ExportRequest(BaseModel):
         "whether the model is told how far the goal lies below the vehicle; by default"
         " as the .zip says, or not"
     )
-    actions: ActionSetName | None = optional(
+    actions: Annotated[ActionSetName | None, COMMON] = optional(
         "action set that the model was trained with: arc-25, paper-25, velocity,"
         " velocity-fixed-yaw, arc3d-75, velocity3d, velocity3d-fixed-yaw, body-rates, or your own"
         " as MODULE:NAME or FILE.py:NAME; by default arc-25, or velocity where a .zip has"

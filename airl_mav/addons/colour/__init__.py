@@ -11,13 +11,7 @@ Guide: docs/explanation/colour.md.
 
 _HERE = "airl_mav.addons.colour"
 
-COMMANDS = {
-    "render": (
-        "show",
-        "draw an arena, or a film of a flight",
-        f"{_HERE}.command",
-    )
-}
+COMMANDS = {"render": ("show", "draw an arena, or a film of a flight", f"{_HERE}.command")}
 COLOUR = {
     "batch": f"{_HERE}.batch:ColourImages",
     "clear": f"{_HERE}.appearance:clear_of",

@@ -145,7 +145,7 @@ class ComputerMeasurement:
     before: MachineState
     after: MachineState
     power: DrawnPower
-    soak: Annotated[Soak | None, COMMON] = None
+    soak: Soak | None = None
     """Result of the soak, if requested."""
     files: tuple[Path, ...] = ()
     """Paths of written files: profile, samples, stamps, facts and soak."""
@@ -306,7 +306,7 @@ class ProfileRequest(CompanionAddresses, Inference):
         le=1,
         default=0.05,
     )
-    soak: str | None = Field(
+    soak: Annotated[str | None, COMMON] = Field(
         default=None,
         description="after the measurement, run inference alone for this time, as 90s, 10min or 1h,"
         " and record latency, frequency and temperature, to detect thermal throttling",

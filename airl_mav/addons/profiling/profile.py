@@ -22,7 +22,7 @@ from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
-from airl_mav.core.fields import COMMON, Group
+from airl_mav.core.fields import COMMON
 from airl_mav.core.machine import (
     MachineState,
     describe_machine,
@@ -57,7 +57,7 @@ UNKNOWN = {"watts": f"{WATTS_REMARK}not measured", "price_usd": "price: not know
 def profile(
     request: ProfileRequest,
     *,
-    out: Annotated[Path | None, COMMON, Group("output")] = None,
+    out: Path | None = None,
     progress: Progress | None = None,
     root: Path = Path("/"),
 ) -> measurement.ComputerMeasurement:
@@ -270,10 +270,10 @@ class ProfileOptions(ProfileRequest):
     policy: Annotated[str | None, POSITIONAL] = Field(
         default=None, description=ProfileRequest.model_fields["policy"].description
     )
-    out: Path = Field(
+    out: Annotated[Path, COMMON, "output"] = Field(
         default=Path("computers"), description="folder of the profile and its samples"
     )
-    share: Annotated[Path | None, COMMON, Group("output")] = Field(
+    share: Annotated[Path | None, COMMON, "output"] = Field(
         default=None,
         description="also write one file (.toml) to be passed on, which another machine flies with"
         " --computer FILE: samples, state of the machine, soak, versions, digest",

@@ -7,10 +7,4 @@ Depends on: training, experiments and their executors; with `--executor ray` on 
 Guide: docs/how-to/sweep.md.
 """
 
-COMMANDS = {
-    "sweep": (
-        "learn",
-        "train and evaluate many networks",
-        "airl_mav.addons.sweep.command",
-    )
-}
+COMMANDS = {"sweep": ("learn", "train and evaluate many networks", "airl_mav.addons.sweep.command")}

@@ -7,11 +7,7 @@ Guide: docs/how-to/view-and-export.md.
 """
 
 COMMANDS = {
-    "video": (
-        "show",
-        "stream the camera to QGroundControl",
-        "airl_mav.addons.video.command",
-    )
+    "video": ("show", "stream the camera to QGroundControl", "airl_mav.addons.video.command")
 }
 
 LIGHT = True
