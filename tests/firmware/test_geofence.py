@@ -16,7 +16,7 @@ from firmware_sim.addons.missions.manager import destination
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.inputs import PositionYaw, Reposition
-from firmware_sim.autopilot.navigation.navigator import (
+from firmware_sim.autopilot.navigation.geofence import (
     FENCE_PERIOD_US,
     Circle,
     FenceMonitor,

@@ -18,7 +18,7 @@ from firmware_sim.autopilot.autopilot_state import Arming, Health, Landed, Setpo
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import BatterySample
-from firmware_sim.mavlink.link import OFF, StreamScheduler
+from firmware_sim.mavlink.message_rates import OFF, StreamScheduler
 from firmware_sim.mavlink.services.commands import requested_mode
 from firmware_sim.mavlink.streams import status, units
 from firmware_sim.mavlink.streams.status import base_mode, system_status, time_estimate_to_target

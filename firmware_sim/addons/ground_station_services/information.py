@@ -18,7 +18,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
-from firmware_sim.mavlink.link import OFF
+from firmware_sim.mavlink.message_rates import OFF
 from firmware_sim.mavlink.streams import Builder, no_content, units
 from firmware_sim.mavlink.streams.sensors import scaled_pressure
 from firmware_sim.mavlink.streams.status import NO_MISSION, base_mode

@@ -37,7 +37,7 @@ from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode
 from firmware_sim.autopilot.modes.return_to_launch import return_height
 from firmware_sim.autopilot.navigation import plan
-from firmware_sim.autopilot.navigation.navigator import FenceMonitor
+from firmware_sim.autopilot.navigation.geofence import FenceMonitor
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, triple
 
 _N = NavCommand

@@ -13,7 +13,7 @@ from airl_mav.core.clock import NS_PER_US
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
-from firmware_sim.mavlink.link import OFF
+from firmware_sim.mavlink.message_rates import OFF
 from firmware_sim.mavlink.streams import Builder
 from firmware_sim.mavlink.streams.units import INT32_MAX
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
