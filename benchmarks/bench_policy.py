@@ -22,9 +22,8 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import open_model
-from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation import Kinematics, encode
-from airl_mav.policy.registry import find_policy
+from airl_mav.policy.registry import find_policy, load_learned
 from airl_mav.scenario.model import DEFAULT_POLICY
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.config import ALGORITHMS, AlgorithmSpec, TrainingConfig

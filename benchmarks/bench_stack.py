@@ -27,7 +27,7 @@ from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.lockstep.stage import ThreadPartner
 from airl_mav.lockstep.turns import FlightDigest
 from airl_mav.lockstep.vehicle import lockstep_link
-from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve

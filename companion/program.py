@@ -22,9 +22,8 @@ from airl_mav.core.machine import describe_machine
 from airl_mav.core.scheduling import held_to
 from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import latency_generator
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
-from airl_mav.policy.registry import camera_refused, find_policy
+from airl_mav.policy.registry import LearnedPolicy, camera_refused, find_policy
 from airl_mav.prediction import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import PROJECTIONS
@@ -32,7 +31,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import checks
 from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion import frame_source, offboard_mission
+from companion import frame_source, pilot
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RATE_HZ, signed
 from companion.mavsdk_link import MavsdkLink
@@ -47,7 +46,7 @@ FLIGHT_S = 600.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class MissionSetup(offboard_mission.Mission):
+class MissionSetup(pilot.Mission):
     """Mission of a stand-alone companion."""
 
     vehicle: VehicleProfile
@@ -122,7 +121,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         limits=limits,
         latency=sampler,
         compensator=compensator,
-        mount_rad=offboard_mission.mount_of(vehicle),
+        mount_rad=pilot.mount_of(vehicle),
         start=asked.start,
         vehicle=vehicle,
         setup=setup,
@@ -185,7 +184,7 @@ def fly_alone(
     abandon: threading.Event,
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
-) -> offboard_mission.MissionResult:
+) -> pilot.MissionResult:
     """Fly one mission with a real flight controller; `stop` lands, `abandon` ends without landing.
 
     `waiting` is called before waiting for the flight controller. Raises UsageError or LinkError.
@@ -209,13 +208,13 @@ def fly_alone(
         waiting()
         link.connect(asked.connect_timeout, stop)
         # The camera is checked before the status messages start, and before take-off.
-        offboard_mission.check_camera(mission.policy, camera, stop, mission.compensator)
+        pilot.check_camera(mission.policy, camera, stop, mission.compensator)
         with (
             reporting(asked, mission, link, camera, clock) as frames,
             recorded(asked, mission, link, clock) as box,
         ):
             decided = None if box is None else box.decided
-            result = offboard_mission.fly_mission(
+            result = pilot.fly_mission(
                 link, frames, mission, clock, stop, abandon, begin, ThreadGuard(clock), decided
             )
             link.tell(f"airl: {result.reason}")
@@ -287,12 +286,12 @@ def look_at_camera(
     mission: MissionSetup, camera: frame_source.FrameSource, clock: Clock, stop: threading.Event
 ) -> Iterator[CheckResult]:
     """Check rate, age and changes of frames, and if they fit the policy."""
-    first = camera.wait(-1, offboard_mission.FRAME_TIMEOUT_S)
+    first = camera.wait(-1, pilot.FRAME_TIMEOUT_S)
     if first is None:
-        yield CheckResult("camera", False, f"no frame for {offboard_mission.FRAME_TIMEOUT_S:g} s")
+        yield CheckResult("camera", False, f"no frame for {pilot.FRAME_TIMEOUT_S:g} s")
         return
     try:
-        offboard_mission.check_camera(mission.policy, camera, stop, mission.compensator)
+        pilot.check_camera(mission.policy, camera, stop, mission.compensator)
     except UsageError as error:
         yield CheckResult("camera", False, str(error))
         return

@@ -4,7 +4,7 @@ In the batch twin, where forty flights take seconds; `level="lockstep"` flies th
 """
 
 from airl_mav import Scenario, rehearse
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 from airl_mav.report.comparison.show import compare_folders
 
 calm = rehearse(Scenario(level="gym", episodes=20), out="runs/calm")

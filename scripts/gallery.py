@@ -28,9 +28,8 @@ from airl_mav.policy.registry import find_policy, policy_names
 from airl_mav.profiles import loading
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.rehearsal.run_folder import load
+from airl_mav.rehearsal.run_folder import arena_of, load
 from airl_mav.report import run_figures, theme
-from airl_mav.report.run_arenas import arena_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "gallery"

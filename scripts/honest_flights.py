@@ -31,7 +31,7 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import wilson
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 from airl_mav.report.document import Column, TableView, print_table, write_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

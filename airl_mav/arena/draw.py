@@ -21,8 +21,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Shape, Tour
-from airl_mav.arena.ground import Ground
+from airl_mav.arena.geometry import Arena, Ground, Shape, Tour
 from airl_mav.arena.walls import over_doors, over_openings
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file

@@ -8,9 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from airl_mav.arena import placement
-from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Statics, Tour
-from airl_mav.arena.ground import Ground
+from airl_mav.arena import geometry, placement
 from airl_mav.arena.placed_assets import AssetBodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.relief import draw_ground, stand_on
 from airl_mav.arena.tours import draw_tours
@@ -57,34 +55,36 @@ class _Request:
     """Values shared by all layouts of one call."""
 
     spec: ArenaSpec
-    bounds: Bounds
+    bounds: geometry.Bounds
     counts: tuple[int, int]
     ring_m: tuple[float, float]
     vehicle_width_m: float
     openings: Openings
     plan: Plan | None
-    ground: Ground | None
+    ground: geometry.Ground | None
     """Hills; None = flat floor."""
 
     @cached_property
-    def walls(self) -> Obstacles:
+    def walls(self) -> geometry.Obstacles:
         """Boxes of the gates, or of the walls between rooms."""
         if self.plan is None:
             return frames(self.openings, self.bounds)
         return room_walls(self.plan, self.bounds)[0]
 
-    def with_walls(self, statics: Statics | None, standing: Obstacles) -> Statics | None:
+    def with_walls(
+        self, statics: geometry.Statics | None, standing: geometry.Obstacles
+    ) -> geometry.Statics | None:
         """Return the owners of static primitives, followed by the boxes of walls."""
         if self.plan is None:
             return with_gates(statics, standing, len(self.openings))
         return with_walls(statics, standing, room_walls(self.plan, self.bounds)[1])
 
     @property
-    def building(self) -> Building | None:
+    def building(self) -> geometry.Building | None:
         """Summary of the rooms for the arena; None = no rooms."""
         if self.plan is None:
             return None
-        return Building(len(self.plan.rooms), len(self.plan.doors), len(self.walls))
+        return geometry.Building(len(self.plan.rooms), len(self.plan.doors), len(self.walls))
 
     @property
     def hills(self) -> placement.Hills | None:
@@ -101,7 +101,7 @@ class _Request:
 
 def generate(
     spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None = None
-) -> Arena:
+) -> geometry.Arena:
     """Generate the arena of a seed, deterministic on any machine with the same numpy.
 
     `spec.count_period` consecutive seeds, from 0 on, share their obstacle counts. A passage at
@@ -147,7 +147,7 @@ def generate(
         except placement.NoRoomError as error:
             failure = max(failure, error, key=lambda each: each.progress)
             continue
-        return Arena(
+        return geometry.Arena(
             name=name,
             seed=seed,
             bounds=request.bounds,
@@ -166,9 +166,9 @@ def generate(
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
 
-def local_bounds(spec: ArenaSpec) -> Bounds:
+def local_bounds(spec: ArenaSpec) -> geometry.Bounds:
     """Return the walls in local NED, origin at the start."""
-    return Bounds(
+    return geometry.Bounds(
         north_min=-spec.start.north_m,
         north_max=spec.size.north_m - spec.start.north_m,
         east_min=-spec.start.east_m,
@@ -178,7 +178,7 @@ def local_bounds(spec: ArenaSpec) -> Bounds:
     )
 
 
-def free_area_fraction(arena: Arena) -> float:
+def free_area_fraction(arena: geometry.Arena) -> float:
     """Return the share of the floor not covered by static obstacles, seen from above."""
     b, n = arena.bounds, arena.n_static
     if arena.statics is not None:  # Parts of one asset may overlap.
@@ -213,7 +213,7 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
 
 
 def _draw_rooms(
-    spec: ArenaSpec, seed: int, bounds: Bounds, name: str, vehicle_width_m: float
+    spec: ArenaSpec, seed: int, bounds: geometry.Bounds, name: str, vehicle_width_m: float
 ) -> Plan | None:
     """Draw the rooms; None = no rooms. Raises UsageError for narrow doors or if no plan fits."""
     if not spec.rooms.drawn:
@@ -258,13 +258,15 @@ def _draw_height(request: _Request, seed: int, goal: placement.Floats) -> float 
 
 def _draw_static(
     rng: np.random.Generator, request: _Request
-) -> tuple[Obstacles, placement.Boxes, Statics | None, tuple[PlacedMesh, ...]]:
+) -> tuple[
+    geometry.Obstacles, placement.Boxes, geometry.Statics | None, tuple[geometry.PlacedMesh, ...]
+]:
     """Draw and place the static obstacles; return bounding boxes, groups and meshes, too."""
     spec, (n, _) = request.spec, request.counts
     bodies: AssetBodies | Things
     if spec.has_assets:
         bodies = things = draw_things(rng, n, spec)
-        statics: Statics | None = things.statics
+        statics: geometry.Statics | None = things.statics
     else:
         bodies, statics = draw_bodies(rng, n, spec.static, spec.flight_altitude_m), None
     # Obstacles keep off start, goal, walls and doors.
@@ -304,7 +306,10 @@ def _draw_static(
 
 
 def _draw_reachable_goal(
-    rng: np.random.Generator, request: _Request, static: Obstacles, standing: placement.Boxes
+    rng: np.random.Generator,
+    request: _Request,
+    static: geometry.Obstacles,
+    standing: placement.Boxes,
 ) -> placement.Floats:
     """Return the fixed goal, or draw a free and reachable one."""
     spec, progress = request.spec, len(static)
@@ -350,7 +355,7 @@ def _draw_reachable_goal(
 
 def _draw_moving(
     rng: np.random.Generator, request: _Request, standing: placement.Boxes
-) -> tuple[Obstacles, tuple[Tour, ...]]:
+) -> tuple[geometry.Obstacles, tuple[geometry.Tour, ...]]:
     """Draw the moving obstacles at time 0, and their tours, around the static bounding boxes."""
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
@@ -389,8 +394,8 @@ def _around(center: placement.Floats, clearance: float) -> placement.Boxes:
     return placement.Boxes(center[None], np.full((1, 2), clearance))
 
 
-def _concatenate(static: Obstacles, moving: Obstacles) -> Obstacles:
-    return Obstacles(
+def _concatenate(static: geometry.Obstacles, moving: geometry.Obstacles) -> geometry.Obstacles:
+    return geometry.Obstacles(
         *(
             np.concatenate([getattr(static, field), getattr(moving, field)])
             for field in ("shape", "center", "half_size", "yaw")

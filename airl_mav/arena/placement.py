@@ -13,8 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Bounds, Obstacles, Shape
-from airl_mav.arena.ground import STEEPEST, Ground
+from airl_mav.arena.geometry import STEEPEST, Bounds, Ground, Obstacles, Shape
 from airl_mav.core.errors import FieldError
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.arena import ArenaSpec

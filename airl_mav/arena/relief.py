@@ -16,8 +16,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Bounds, Obstacles, PlacedMesh, Shape, Statics
-from airl_mav.arena.ground import COLUMNS, ROWS, Floats, Ground, Relief
+from airl_mav.arena.geometry import (
+    COLUMNS,
+    ROWS,
+    Bounds,
+    Floats,
+    Ground,
+    Obstacles,
+    PlacedMesh,
+    Relief,
+    Shape,
+    Statics,
+)
 from airl_mav.arena.placement import Boxes
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.arena import Terrain

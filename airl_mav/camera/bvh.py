@@ -15,8 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import PlacedMesh
-from airl_mav.arena.ground import Ground, Relief, no_relief
+from airl_mav.arena.geometry import Ground, PlacedMesh, Relief, no_relief
 from airl_mav.arena.relief import plane_at
 from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
 from airl_mav.camera.primitives import GROUND, OBSTACLE

@@ -21,7 +21,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream, words_of
 from airl_mav.profiles.camera import Camera, Ranging
-from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import SensorNoise
 
 
 class Matching(NamedTuple):

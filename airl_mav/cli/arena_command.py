@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.arena.generate import free_area_fraction, generate
-from airl_mav.arena.geometry import Arena, Shape, Tour
-from airl_mav.arena.ground import STEEPEST
+from airl_mav.arena.geometry import STEEPEST, Arena, Shape, Tour
 from airl_mav.arena.placement import Floats, zone_of
 from airl_mav.arena.walls import openings_of
 from airl_mav.cli.options import POSITIONAL

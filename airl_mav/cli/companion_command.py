@@ -13,10 +13,10 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.core.files import save_arrays
 from airl_mav.core.progress import new_console
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.conducted import Abandoned
 from companion.link_interface import LinkError
 from companion.program import MissionSetup, check_on_ground, fly_alone, prepare
 from companion.systemd import service
+from companion.watchdog import Abandoned
 
 
 class CompanionOptions(StandAloneCompanion):

@@ -12,9 +12,8 @@ from rich.console import Console
 
 from airl_mav import __version__
 from airl_mav.core.addons import entries
-from airl_mav.core.errors import EXIT_USAGE
+from airl_mav.core.errors import EXIT_USAGE, refer
 from airl_mav.core.progress import new_console
-from airl_mav.core.unsupported import refer
 
 GROUPS = {
     "fly": "Fly",

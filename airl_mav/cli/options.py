@@ -24,10 +24,10 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from airl_mav.core import errors
+from airl_mav.core.errors import refer
 from airl_mav.core.fields import range_of, validated
 from airl_mav.core.first_start import shown_by
 from airl_mav.core.progress import RichProgress, new_console
-from airl_mav.core.unsupported import refer
 from airl_mav.faults import Fault
 from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.aircraft import IN_WORDS

@@ -15,9 +15,8 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.progress import new_console
-from airl_mav.rehearsal.run_folder import RUN_FILE, load
+from airl_mav.rehearsal.run_folder import RUN_FILE, load, trust_arenas
 from airl_mav.report.comparison.comparison_model import comparison_file, kind_of
-from airl_mav.report.run_arenas import trust_arenas
 
 
 class ReportOptions(ProfileModel):

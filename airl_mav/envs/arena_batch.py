@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.arena.ground import COLUMNS, GRID_SIZE, ROWS, STEEPEST, Relief
+from airl_mav.arena.geometry import COLUMNS, GRID_SIZE, ROWS, STEEPEST, Arena, Relief, Shape
 from airl_mav.arena.relief import extreme_within
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.kernels import kernel

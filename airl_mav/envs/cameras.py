@@ -28,7 +28,7 @@ from airl_mav.envs.mesh_batch import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.faults import NOISE_SEED, Fault
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import SensorNoise
 
 NEVER_US = 1 << 50
 """Time beyond the end of any flight [µs]."""

@@ -31,8 +31,7 @@ from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.faults import Fault
 from airl_mav.latency.injection import Injection, LatencySampler, latency_generator
 from airl_mav.policy.observation import Kinematics, Rows
-from airl_mav.profiles.conditions import WindSettings
-from airl_mav.profiles.vehicle import Estimation
+from airl_mav.profiles.vehicle import Estimation, WindSettings
 from airl_mav.vehicle.atmosphere import BLOCK as WIND_BLOCK
 from airl_mav.vehicle.atmosphere import Wind, wind_of_episode
 

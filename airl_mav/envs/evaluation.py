@@ -25,8 +25,8 @@ from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 from airl_mav.policy.actions import Action, Policy, command_numbers, commands, flyable
 from airl_mav.policy.layouts import Encoded, encode_layout
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import LearnedPolicy
 
 Decide = Callable[[Encoded], NDArray[Any]]
 """Function from observations of n vehicles to n actions; must treat each row independently."""

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena
-from airl_mav.arena.ground import Relief
+from airl_mav.arena.geometry import Arena, Relief
 from airl_mav.camera.bvh import UNSEEN, Bvh, Forest, Meshes, forest_of, ground_tree, placed_in
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.assets import MeshFile

@@ -54,11 +54,10 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.conditions import Payload, check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.projections import CameraKind
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import Payload, VehicleProfile, check_spread, equipped
 from airl_mav.vehicle.airframe import draw_airframe, spreads
 
 if TYPE_CHECKING:

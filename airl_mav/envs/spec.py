@@ -25,8 +25,7 @@ from airl_mav.policy.layouts import LEAST_ROWS, STRIP_ROWS
 from airl_mav.policy.observation_spec import CameraName, Frames, GoalHeight, LayoutName, Told
 from airl_mav.profiles import projections
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
-from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import SensorNoise, Spread, WindSettings, load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "progress", "paced", "paper-scaled", "paper")
 """See `envs.rewards`."""

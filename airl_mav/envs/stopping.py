@@ -26,10 +26,9 @@ from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.spec import Delay, EnvironmentSpec
 from airl_mav.latency.injection import Injection, choose_injection, longest_ms, parse_latency
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.conditions import Payload, equipped
 from airl_mav.profiles.loading import profile_digest
 from airl_mav.profiles.parameters import flown_values
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import Payload, VehicleProfile, equipped
 
 SCHEMA = 1
 """Version of the stored measurement."""

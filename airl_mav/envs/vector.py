@@ -13,18 +13,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs import saved_state
+from airl_mav.envs import navigation_env, saved_state
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
-from airl_mav.envs.navigation_env import (
-    FLYING,
-    FleetDecisions,
-    action_space,
-    draw_seeds,
-    episode_seed,
-    observation_space,
-    outcome,
-    zone_option,
-)
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.layouts import Encoded
@@ -34,7 +24,9 @@ AHEAD = 32
 
 
 class NavigationVectorEnv(
-    FleetDecisions, saved_state.Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]
+    navigation_env.FleetDecisions,
+    saved_state.Stateful,
+    VectorEnv[Encoded, NDArray[Any], NDArray[Any]],
 ):
     """N flights; by default they reset in the step in which they end (Gymnasium's SAME_STEP).
 
@@ -86,8 +78,10 @@ class NavigationVectorEnv(
         super().__init__(spec, knobs, num_envs)
         self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
-        self.single_observation_space = observation_space(self.navigation.observation)
-        self.single_action_space = action_space(self.environment.action_spec)
+        self.single_observation_space = navigation_env.observation_space(
+            self.navigation.observation
+        )
+        self.single_action_space = navigation_env.action_space(self.environment.action_spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -113,7 +107,7 @@ class NavigationVectorEnv(
         options = dict(options or {})
         chosen = self._chosen(options.pop("reset_mask", None))
         if seed is not None or options:
-            self._zone = zone_option(options)
+            self._zone = navigation_env.zone_option(options)
         own: list[int | None] = [None] * self.num_envs
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
@@ -122,7 +116,7 @@ class NavigationVectorEnv(
                 raise UsageError(
                     f"seed = {seed!r}: accepted: a whole number, or one for each environment"
                 )
-            own = [None if each is None else episode_seed(each) for each in seed]
+            own = [None if each is None else navigation_env.episode_seed(each) for each in seed]
             if len(own) != self.num_envs:
                 raise UsageError(f"seed: {len(own)} numbers; accepted: {self.num_envs}")
             # Given seeds also seed the generator, so that later episodes are reproducible.
@@ -130,7 +124,7 @@ class NavigationVectorEnv(
                 self.np_random = np.random.default_rng(np.random.SeedSequence(given))
         slots = np.flatnonzero(chosen).tolist()
         own = [own[i] for i in slots]
-        drawn = iter(draw_seeds(self.np_random, own.count(None)))
+        drawn = iter(navigation_env.draw_seeds(self.np_random, own.count(None)))
         seeds = [next(drawn) if each is None else each for each in own]
         flights = self._begin(slots, seeds)
         return self.navigation.observe(), _masked(self._quality(flights), chosen)
@@ -188,15 +182,15 @@ class NavigationVectorEnv(
         """Return the mask (n,) of flights that ended in an earlier step and have not restarted."""
         if self._before is None:
             return np.zeros(self.num_envs, np.bool_)
-        over: NDArray[np.bool_] = self._before.verdict != FLYING
+        over: NDArray[np.bool_] = self._before.verdict != navigation_env.FLYING
         return over
 
     def _next_seeds(self, n: int) -> list[int]:
         """Draw the seeds of n episodes; if their arenas are missing, generate more ahead."""
-        zone, seeds = self._present_zone, draw_seeds(self.np_random, n)
+        zone, seeds = self._present_zone, navigation_env.draw_seeds(self.np_random, n)
         if not self.navigation.places.prepared(seeds, zone):
             # From a copy of the generator, so the same seeds will be drawn later.
-            following = draw_seeds(deepcopy(self.np_random), AHEAD)
+            following = navigation_env.draw_seeds(deepcopy(self.np_random), AHEAD)
             self.navigation.places.prepare([*seeds, *following], zone)
         return seeds
 
@@ -264,7 +258,7 @@ def _outcomes(flights: FlightArrays, ended: NDArray[np.bool_]) -> dict[str, NDAr
     """Return the additional entries of `info` for flights that have ended."""
     outcomes = np.full(len(ended), None, dtype=object)
     for i in np.flatnonzero(ended).tolist():
-        outcomes[i] = outcome(flights, i)["outcome"]
+        outcomes[i] = navigation_env.outcome(flights, i)["outcome"]
     return {"success": flights.verdict == FlightStatus.SUCCESS, "outcome": outcomes}
 
 

@@ -28,8 +28,8 @@ from airl_mav.faults import check_gym
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import measure_quality
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
+from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.checks import action_generator

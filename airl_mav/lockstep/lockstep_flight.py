@@ -29,7 +29,7 @@ from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.resolve import ResolvedScenario
-from companion.offboard_mission import Mission, MissionResult, Start, check_camera, fly_mission
+from companion.pilot import Mission, MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import FirmwareLostError

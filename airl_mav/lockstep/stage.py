@@ -27,10 +27,10 @@ from airl_mav.lockstep.vehicle import (
     MemoryCamera,
     builtin_vehicle,
 )
-from companion.conducted import Abandoned, ConductedClock, Poll
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
 from companion.mavsdk_link import MavsdkLink
+from companion.watchdog import Abandoned, ConductedClock, Poll
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.fault_timeline import FaultTimeline
 from firmware_sim.firmware import Firmware

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.actions import AnyAction, Policy
 from airl_mav.policy.observation import Observation
-from companion.conducted import Poll
+from companion.watchdog import Poll
 
 COMPANION_STARTS_US = US_PER_S // 10
 """Delay from the boot of the flight controller to the start of the companion [µs]."""

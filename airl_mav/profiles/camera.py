@@ -21,7 +21,7 @@ from airl_mav.profiles import projections
 if TYPE_CHECKING:
     from airl_mav.faults import Fault
     from airl_mav.profiles.arena import ArenaSpec
-    from airl_mav.profiles.conditions import SensorNoise
+    from airl_mav.profiles.vehicle import SensorNoise
 
     Imaging: TypeAlias = Any
 else:

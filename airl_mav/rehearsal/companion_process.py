@@ -23,7 +23,7 @@ from companion.frame_source import open_camera
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import Mission, check_camera, fly_mission
+from companion.pilot import Mission, check_camera, fly_mission
 from companion.watchdog import ThreadGuard
 
 CONNECT_TIMEOUT_S = 30.0

@@ -25,9 +25,8 @@ from airl_mav.core.signing import StoredSigning
 from airl_mav.faults import PROCESSES, Fault, link_fails
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import check_noise, check_renderer
-from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile, check_spread, equipped
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.channel import State
 from airl_mav.rehearsal.live_view import view_part

@@ -34,9 +34,8 @@ from airl_mav.latency.stages import (
     summarize,
 )
 from airl_mav.policy.registry import find_policy
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, vehicle_of
 from airl_mav.report.document import NONE, TOO_FEW_CELL, TableView, columns_of, with_interval
-from airl_mav.report.run_arenas import vehicle_of
 
 FEW_FLIGHTS = 10
 """Number of flights below which a bootstrap interval covers clearly less than 95 %."""

@@ -22,9 +22,8 @@ from airl_mav.core.frames import goal_height_m, quats_to_euler
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, flown_path
 from airl_mav.report.document import OUTCOME_LABELS
-from airl_mav.report.run_arenas import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.scene import GLASS_OPACITY
 

@@ -28,9 +28,8 @@ from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
 from airl_mav.policy import observation
 from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
-from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation_spec import MOST_FRAMES
-from airl_mav.policy.registry import find_policy
+from airl_mav.policy.registry import LearnedPolicy, find_policy, load_learned
 from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile

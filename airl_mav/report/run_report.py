@@ -25,13 +25,12 @@ from airl_mav.flight.episode_record import EpisodeRecord, ranked
 from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import LoadedRun, arenas_of, flown_path, load, vehicle_of
 from airl_mav.report import document, plotly_scene, run_tables, tracking
 from airl_mav.report.document import Section, ms, tables_section
 from airl_mav.report.energy_section import energy_section
 from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
-from airl_mav.report.run_arenas import arenas_of, flown_path, vehicle_of
 from airl_mav.report.run_figures import map_figure, overview_picture
 from airl_mav.report.run_verdict import OverallVerdict, save_verdict, verdict_of
 from airl_mav.report.theme import FigureImage, palette, shades

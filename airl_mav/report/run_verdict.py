@@ -25,7 +25,7 @@ from airl_mav.flight.statistics import Aggregate, Estimate, PairedComparison, ag
 from airl_mav.latency.injection import moments
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.document import environment
-from airl_mav.scenario.scenario_file import SCENARIO_FILE
+from airl_mav.scenario.model import SCENARIO_FILE
 
 SCHEMA = 1
 """Schema version of `verdict.json`, described in docs/reference/run-folder.md."""

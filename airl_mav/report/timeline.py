@@ -25,15 +25,7 @@ from airl_mav.latency.stages import (
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report import run_tables, theme
-from airl_mav.report.document import (
-    SHEET_COLUMNS,
-    Section,
-    TableView,
-    columns_of,
-    ms,
-    tables_section,
-)
+from airl_mav.report import document, run_tables, theme
 from airl_mav.report.run_figures import latency_figure, long_tail
 
 if TYPE_CHECKING:
@@ -68,13 +60,13 @@ OUTLIER_NOTE = (
 )
 
 
-def latency_section(page: ReportInput) -> tuple[Section, ...]:
+def latency_section(page: ReportInput) -> tuple[document.Section, ...]:
     """Return the latency by stage, every decision, and outliers."""
     run, summary, decisions = page.run, page.summary, timeline_of(page.run)
     measured = [stage for stage in summary.shown_stages if summary.stages[stage.key].n]
     # Constant stages need no figure: the table already shows their value.
     drawn = [stage for stage in measured if np.ptp(summary.samples[stage.key])]
-    timeline = Section(
+    timeline = document.Section(
         "Every decision, in the order flown",
         level=3,
         draw=lambda: [timeline_figure(decisions, drawn)],
@@ -82,18 +74,18 @@ def latency_section(page: ReportInput) -> tuple[Section, ...]:
         note="\n".join([*sawtooth_notes(decisions, page.vehicle), OUTLIER_NOTE]),
     )
     return (
-        *tables_section(
+        *document.tables_section(
             run_tables.latency_table(summary),
             run_tables.ages_table(run_tables.run_ages(run), summary.stages["end_to_end"]),
             draw=lambda: [
                 latency_figure(s, summary.samples[s.key], summary.stages[s.key]) for s in drawn
             ],
             sheet="latency.png",
-            columns=SHEET_COLUMNS,
+            columns=document.SHEET_COLUMNS,
             template="latency.html.j2",
         ),
         *((timeline,) if drawn and len(decisions) else ()),
-        *tables_section(slowest_table(decisions, measured), level=3),
+        *document.tables_section(slowest_table(decisions, measured), level=3),
     )
 
 
@@ -241,7 +233,7 @@ def _mark_outliers(ax: Axes, there: NDArray[np.int64], found: Samples, limit: Fe
 
 
 def _outlier_text(limit: Fence) -> str:
-    where = f"above {ms(limit.limit_us)} ms"
+    where = f"above {document.ms(limit.limit_us)} ms"
     if limit.second_kind:
         return f"{limit.beyond / limit.n:.0%} {where}: a second kind, not marked"
     if not limit.beyond:
@@ -271,14 +263,15 @@ def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[s
         way = "older" if drift_us > 0.0 else "younger"
         notes.append(
             f"The saw in {stage.title} is no fault: the camera takes a frame every "
-            f"{ms(frame_us, 1)} ms and a decision comes every {ms(period, 1)} ms, which is "
-            f"{frames:.2f} frames. Each decision finds its frame {ms(abs(drift_us), 1)} ms {way} "
+            f"{document.ms(frame_us, 1)} ms and a decision comes every "
+            f"{document.ms(period, 1)} ms, which is {frames:.2f} frames. Each decision finds its "
+            f"frame {document.ms(abs(drift_us), 1)} ms {way} "
             "than the one before did, until the next frame takes its place."
         )
     return notes
 
 
-def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> TableView | None:
+def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> document.TableView | None:
     """Return the table of outliers from frame to motors; None without outliers."""
     whole = timeline.stages["end_to_end"]
     there = np.flatnonzero(whole != NO_STAMP)
@@ -290,15 +283,17 @@ def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> TableView | No
     beyond = beyond[np.argsort(-whole[beyond], kind="stable")[:SLOWEST]]
     parts = [s for s in STAGES if s in stages and s.key not in ("end_to_end", "t3")]
     rows = tuple(_slow_row(timeline, int(k), median, parts) for k in beyond)
-    columns = columns_of(
+    columns = document.columns_of(
         "flight | at [s] | end to end [ms] | times the median | <longest part | of it [ms]"
     )
     notes = (
-        f"{limit.beyond:,} of {limit.n:,} decisions above {ms(limit.limit_us)} ms; "
+        f"{limit.beyond:,} of {limit.n:,} decisions above {document.ms(limit.limit_us)} ms; "
         f"the {len(rows)} longest. Times from the start of navigation.",
     )
     links = [(timeline.flight_of(int(k)), float(timeline.since_us[k]) / US_PER_S) for k in beyond]
-    return TableView("slowest", "Decisions that stand out", columns, rows, notes, links=links)
+    return document.TableView(
+        "slowest", "Decisions that stand out", columns, rows, notes, links=links
+    )
 
 
 def _slow_row(
@@ -312,8 +307,8 @@ def _slow_row(
     return (
         f"{timeline.flight_of(decision)}",
         f"{timeline.since_us[decision] / US_PER_S:.2f}",
-        ms(whole),
+        document.ms(whole),
         f"{whole / median_us:.1f}",
         title,
-        ms(spent.get(title)),
+        document.ms(spent.get(title)),
     )

@@ -19,10 +19,9 @@ from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, estimate_of
 from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, commanded, setpoint_column
-from airl_mav.rehearsal.run_folder import MOTOR_OUTPUTS, MOTOR_TIMES, LoadedRun
+from airl_mav.rehearsal.run_folder import MOTOR_OUTPUTS, MOTOR_TIMES, LoadedRun, flown_path
 from airl_mav.report import theme
 from airl_mav.report.policy_view import SeenDecision
-from airl_mav.report.run_arenas import flown_path
 from airl_mav.report.theme import pictured
 
 Floats = NDArray[np.float64]

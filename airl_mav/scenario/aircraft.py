@@ -10,8 +10,8 @@ from pydantic import Field
 
 from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switch
 from airl_mav.faults import Fault
-from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projections import Renderer
+from airl_mav.profiles.vehicle import Payload, SensorNoise, Spread, WindSettings
 
 VehicleName = Annotated[
     str, Field(description="vehicle profile: a shipped name, or a path to a .toml"), COMMON

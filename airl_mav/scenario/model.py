@@ -7,12 +7,16 @@ Meaning, unit, range and default of a setting are defined only here.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+import tomli_w
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.fields import COMMON, ProfileModel, field_error, optional, quantity, switch
+from airl_mav.core.files import replace_file
+from airl_mav.core.plugins import names_file
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import KINDS, UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NOT_IN_GYM, Aircraft
@@ -398,3 +402,30 @@ def free_fields(level: LevelName) -> frozenset[str]:
     free = {name for name, field in Scenario.model_fields.items() if FREE in field.metadata}
     # At level sitl, the effect of this machine's compute time scales with the speed.
     return frozenset(free - {"speed"} if level == "sitl" else free)
+
+
+SCENARIO_FILE = "scenario.toml"
+"""Scenario file in a run folder."""
+
+
+def save_scenario(scenario: Scenario, path: Path) -> None:
+    """Write a scenario with absolute paths; fields at None are omitted."""
+    data = anchored(scenario).model_dump(mode="json", exclude_none=True)
+    replace_file(path, tomli_w.dumps(data).encode())
+
+
+def anchored(scenario: Scenario) -> Scenario:
+    """Return a scenario with absolute paths, independent of the working directory."""
+    # Late import: reading a command line or a run folder needs no policy.
+    from airl_mav.policy.registry import policy_names
+
+    policy, latency = scenario.policy, scenario.latency or ""
+    named = {name: getattr(scenario, name) for name in ("vehicle", "arena", "computer")}
+    paths = {name: value for name, value in named.items() if value.endswith(".toml")}
+    if names_file(policy) or (policy not in policy_names() and Path(policy).is_dir()):
+        paths["policy"] = policy
+    if ".toml/" in latency or Path(latency).is_file():
+        paths["latency"] = latency
+    real = {name: value.absolute() for name, value in scenario.real if isinstance(value, Path)}
+    changes: dict[str, Any] = {name: f"{Path(value).absolute()}" for name, value in paths.items()}
+    return scenario.model_copy(update={**changes, "real": scenario.real.model_copy(update=real)})

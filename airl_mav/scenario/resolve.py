@@ -27,21 +27,18 @@ from airl_mav.latency.injection import (
     without_timing,
 )
 from airl_mav.policy.actions import Policy
-from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
+from airl_mav.policy.registry import LearnedPolicy, PolicyInfo, camera_refused, find_policy
 from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.computer import ComputerProfile
-from airl_mav.profiles.conditions import check_spread, equipped
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.projections import CameraKind
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile, check_spread, equipped
 from airl_mav.scenario import checks
 from airl_mav.scenario.aircraft import FirmwareName, PlantName
-from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
-from airl_mav.scenario.scenario_file import anchored
+from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings, anchored
 
 _FLIGHT = "firmware_sim.warm_up"
 _VECTORIZED = "airl_mav.envs.navigation"

@@ -10,8 +10,7 @@ import numpy as np
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.conditions import Spread
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import Spread, VehicleProfile
 from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, normalize, rotate
 
 

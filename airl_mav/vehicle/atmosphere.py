@@ -10,7 +10,7 @@ from airl_mav.core import constants
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 
 _EXPONENT = constants.GRAVITY_M_S2 / (constants.GAS_CONSTANT_AIR * constants.TEMPERATURE_LAPSE_K_M)
 

@@ -11,26 +11,18 @@ from airl_mav.control.memory import ticks_to_motors
 from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim import interfaces
-from firmware_sim.autopilot import commander, inputs
-from firmware_sim.autopilot.autopilot_state import (
-    UNTOLD,
-    OperatorText,
-    Result,
-    Setpoint,
-    Severity,
-    Wire,
-)
+from firmware_sim.autopilot import autopilot_state, commander
 from firmware_sim.autopilot.climb import DECIDE_US, climb_record
 from firmware_sim.autopilot.error_state import RATES, KernelFilter, NewFilter, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent as Told
-from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
-from firmware_sim.autopilot.failsafes.supervisor import Supervisor
+from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention, Supervisor
 from firmware_sim.autopilot.flight_commander import AutoDisarm, Commanded, FlightCommander
 from firmware_sim.autopilot.flight_modes import WITH_STICKS, Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
 from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator, Whereabouts
 from firmware_sim.autopilot.navigation.plan import NavigationState, Plans
 from firmware_sim.autopilot.parameter_store import Parameters
@@ -71,7 +63,7 @@ class BuiltinAutopilot:
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._guidance.context.missions = self._navigator.missions
-        self._manual_control = inputs.ManualControl(value)
+        self._manual_control = interface.ManualControl(value)
         self._events: list[Told] = []
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
         """Failsafe and pre-arm checks."""
@@ -80,7 +72,7 @@ class BuiltinAutopilot:
         self._controller = Controller(Gains.from_parameters(value), record)
         self._memory: Vector = record["memory"][0]
         parameters.on_change(self._parameters_changed)
-        self._messages: list[OperatorText] = []
+        self._messages: list[autopilot_state.OperatorText] = []
         self._demand: AnyDemand | None = None
         """Active demand; None = the motors are stopped."""
         self._taken_us = -1
@@ -118,9 +110,9 @@ class BuiltinAutopilot:
         """Failure injection for client requests; None: not supported. Set by the simulation."""
         self.logs = interfaces.LogStore()
         """Flight logs for clients. Set by the log writer."""
-        self.on_setpoint: Callable[[Wire, int], None] | None = None
+        self.on_setpoint: Callable[[autopilot_state.Wire, int], None] | None = None
         """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
-        self.on_message: Callable[[OperatorText], None] | None = None
+        self.on_message: Callable[[autopilot_state.OperatorText], None] | None = None
         """Callback for operator texts."""
         self._say_all(parameters.take_texts())
 
@@ -348,10 +340,10 @@ class BuiltinAutopilot:
         """Return whether the navigator has no work, as in its newest step."""
         return self._navigator.idle and self._navigates_on() == self._navigated_on
 
-    def _return_place(self) -> inputs.PositionYaw | None:
+    def _return_place(self) -> interface.PositionYaw | None:
         """Return the destination of Return: home, or the place selected by RTL_TYPE."""
         context, now = self._guidance.context, self._situation()
-        home = inputs.PositionYaw(context.home, context.home_yaw)
+        home = interface.PositionYaw(context.home, context.home_yaw)
         return home if now is None else self._navigator.return_place(now, home)
 
     def _situation(self) -> NavigationState | None:
@@ -372,7 +364,7 @@ class BuiltinAutopilot:
             self.supervisor.watch.reports.mission_missing = not valid
         self._commander.look()
 
-    def say(self, message: OperatorText) -> None:
+    def say(self, message: autopilot_state.OperatorText) -> None:
         """Send a text to the operator."""
         self._messages.append(message)
         if message.event is not None:
@@ -387,7 +379,7 @@ class BuiltinAutopilot:
         self.supervisor.read_parameters()
         self._say_all(self.parameters.take_texts())
 
-    def _say_all(self, messages: Sequence[OperatorText]) -> None:
+    def _say_all(self, messages: Sequence[autopilot_state.OperatorText]) -> None:
         for message in messages:
             self.say(message)
 
@@ -433,7 +425,7 @@ class BuiltinAutopilot:
     def close(self) -> None:
         """Do nothing: there are no resources to release."""
 
-    def take_messages(self) -> list[OperatorText]:
+    def take_messages(self) -> list[autopilot_state.OperatorText]:
         """Return texts for the operator since the last call."""
         taken, self._messages, self._unsaid = self._messages, [], 0
         return taken
@@ -449,7 +441,7 @@ class BuiltinAutopilot:
         """Report all failing pre-arm checks again (MAV_CMD_RUN_PREARM_CHECKS)."""
         self.supervisor.tell_checks()
 
-    def arm(self, *, force: bool) -> Result:
+    def arm(self, *, force: bool) -> autopilot_state.Result:
         """Request arming. The pre-arm checks also run for a forced request, as in PX4."""
         del force
         # Without samples or when armed already, no check applies: the commander answers.
@@ -463,17 +455,19 @@ class BuiltinAutopilot:
             commander.CommanderEvent.ARM_UNREADY if refusals else commander.CommanderEvent.ARM
         )
 
-    def terminate(self) -> Result:
+    def terminate(self) -> autopilot_state.Result:
         """Request permanent motor stop (MAV_CMD_DO_FLIGHTTERMINATION)."""
         return self._commander.handle(commander.Ask(Mode.TERMINATION))
 
-    def disarm(self, *, force: bool) -> Result:
+    def disarm(self, *, force: bool) -> autopilot_state.Result:
         """Request disarming; force = kill, also in the air."""
         return self._commander.handle(
             commander.CommanderEvent.KILL if force else commander.CommanderEvent.DISARM
         )
 
-    def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
+    def takeoff(
+        self, altitude_m: float | None, place: tuple[float, float] | None = None
+    ) -> autopilot_state.Result:
         """Request a take-off to a height above home [m] and a place, local NED north, east [m].
 
         Default height: MIS_TAKEOFF_ALT; default place: straight up.
@@ -483,8 +477,8 @@ class BuiltinAutopilot:
         return self._ask(Mode.TAKEOFF)
 
     def set_mode(
-        self, mode: Mode, request: inputs.ModeRequest | None = None, *, commanded: bool = False
-    ) -> Result:
+        self, mode: Mode, request: interface.ModeRequest | None = None, *, commanded: bool = False
+    ) -> autopilot_state.Result:
         """Request a mode with its optional arguments.
 
         `commanded` is True for a specific command (NAV_LAND), whose acceptance is reported.
@@ -496,12 +490,12 @@ class BuiltinAutopilot:
     def _ask(
         self,
         mode: Mode,
-        request: inputs.ModeRequest | None = None,
-        granted: OperatorText | None = None,
-    ) -> Result:
+        request: interface.ModeRequest | None = None,
+        granted: autopilot_state.OperatorText | None = None,
+    ) -> autopilot_state.Result:
         if not self._guidance.flies(mode):
             self.say(commander.unavailable(mode))
-            return Result.TEMPORARILY_REJECTED
+            return autopilot_state.Result.TEMPORARILY_REJECTED
         self._look_anew(mode)
         # The geofence may forbid the place of the request.
         if self.flight.phase >= _GROUND:
@@ -515,42 +509,55 @@ class BuiltinAutopilot:
         """Set the horizontal speed of the present automatic mode [m/s]."""
         self._guidance.context.travel.speed_m_s = speed_m_s
 
-    def start_mission(self, index: int) -> Result:
+    def start_mission(self, index: int) -> autopilot_state.Result:
         """Arm and fly the mission from an item (MAV_CMD_MISSION_START); -1 = current item."""
         if not self._navigator.mission_is_valid(self._situation()):
-            self.say(OperatorText.of(Severity.CRITICAL, events.MISSION_DENIED))
-            return Result.DENIED
+            self.say(
+                autopilot_state.OperatorText.of(
+                    autopilot_state.Severity.CRITICAL, events.MISSION_DENIED
+                )
+            )
+            return autopilot_state.Result.DENIED
         # -1 means the current item.
         if not -1 <= index < len(self.plans.mission):
-            return Result.DENIED
+            return autopilot_state.Result.DENIED
         self._commander.handle(commander.Ask(Mode.MISSION))
-        if self.flight.phase < _GROUND and self.arm(force=False) is not Result.ACCEPTED:
-            return Result.TEMPORARILY_REJECTED
+        if (
+            self.flight.phase < _GROUND
+            and self.arm(force=False) is not autopilot_state.Result.ACCEPTED
+        ):
+            return autopilot_state.Result.TEMPORARILY_REJECTED
         if index >= 0:
             self.plans.set_current(index)
-        return Result.ACCEPTED
+        return autopilot_state.Result.ACCEPTED
 
     # --- towards the mission (navigation.plan.Crew)
 
-    def set_home(self, place: Geodetic | None) -> Result:
+    def set_home(self, place: Geodetic | None) -> autopilot_state.Result:
         """Move home; None = the current position."""
         done = self._home.set_here() if place is None else self._home.set_to(place)
         # Home is part of the snapshot, and modes may fly to it.
         self._snapshot, self._due_us = None, 0
-        return Result.ACCEPTED if done else Result.TEMPORARILY_REJECTED
+        return (
+            autopilot_state.Result.ACCEPTED if done else autopilot_state.Result.TEMPORARILY_REJECTED
+        )
 
-    def set_origin(self, place: Geodetic) -> Result:
+    def set_origin(self, place: Geodetic) -> autopilot_state.Result:
         """Move the origin of local NED; rejected while armed.
 
         PX4 also moves it in flight and shifts all local positions.
         """
         if self.flight.phase >= _GROUND:
-            self.say(OperatorText(Severity.WARNING, "Origin is not moved while armed"))
-            return Result.TEMPORARILY_REJECTED
+            self.say(
+                autopilot_state.OperatorText(
+                    autopilot_state.Severity.WARNING, "Origin is not moved while armed"
+                )
+            )
+            return autopilot_state.Result.TEMPORARILY_REJECTED
         self.estimator.move_origin(place)
         self._home.find()
         self._snapshot, self._due_us = None, 0
-        return Result.ACCEPTED
+        return autopilot_state.Result.ACCEPTED
 
     def look_at(self, place: Geodetic | None) -> None:
         """Turn the nose to a place during a mission; None = cancel."""
@@ -560,7 +567,7 @@ class BuiltinAutopilot:
         """Abort the mission and return."""
         self.set_mode(Mode.RETURN, commanded=True)
 
-    def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
+    def offer_setpoint(self, setpoint: autopilot_state.Setpoint, time_us: int) -> None:
         """Pass on a valid offboard setpoint, received at `time_us` of simulated time."""
         self._guidance.context.offer(setpoint)
         self.supervisor.setpoint(setpoint, time_us)
@@ -568,7 +575,10 @@ class BuiltinAutopilot:
             self.on_setpoint(setpoint.wire, time_us)
 
     def offer_attitude(
-        self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
+        self,
+        demand: AttitudeDemand | RateDemand,
+        time_us: int,
+        wire: autopilot_state.Wire = autopilot_state.UNTOLD,
     ) -> None:
         """Pass on an offboard setpoint of attitude or body rates, received at `time_us`.
 
@@ -584,7 +594,9 @@ class BuiltinAutopilot:
         """Record the reason of a rejected offboard setpoint, which the next failsafe names."""
         self._commander.refusal = reason, time_us
 
-    def manual_control(self, sticks: inputs.Sticks, source: inputs.Source, time_us: int) -> None:
+    def manual_control(
+        self, sticks: interface.Sticks, source: interface.Source, time_us: int
+    ) -> None:
         """Pass on the pilot's sticks, received at `time_us` of simulated time."""
         moved = self._manual_control.offer(sticks, source, time_us)
         self.supervisor.watch.hear_pilot(time_us)
@@ -598,24 +610,32 @@ class BuiltinAutopilot:
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(commander.Ask(Mode.POSITION))
-            self.say(OperatorText.of(Severity.INFO, events.PILOT_TOOK_OVER))
+            self.say(
+                autopilot_state.OperatorText.of(
+                    autopilot_state.Severity.INFO, events.PILOT_TOOK_OVER
+                )
+            )
 
     def receive(self, name: str, reading: Any) -> None:
         """Pass on a reading of a client's sensor: odometry, distance or flow."""
         fused, self._snapshot = self.estimator.receive(name, reading), None
         if not fused and name not in self._unfused:
             self._unfused.add(name)
-            self.say(OperatorText(Severity.WARNING, f"No add-on fuses the sensor: {name}"))
+            self.say(
+                autopilot_state.OperatorText(
+                    autopilot_state.Severity.WARNING, f"No add-on fuses the sensor: {name}"
+                )
+            )
 
-    def see_obstacles(self, obstacles: inputs.ObstacleBins) -> None:
+    def see_obstacles(self, obstacles: interface.ObstacleBins) -> None:
         """Pass on the distances to obstacles."""
         self._guidance.context.obstacles = obstacles
 
-    def follow(self, target: inputs.FollowedTarget) -> None:
+    def follow(self, target: interface.FollowedTarget) -> None:
         """Pass on the position of the Follow target."""
         self._guidance.context.target = target
 
-    def landing_target(self, target: inputs.LandingTarget) -> None:
+    def landing_target(self, target: interface.LandingTarget) -> None:
         """Pass on the position of the precision landing target."""
         self._guidance.context.landing_target = target
 

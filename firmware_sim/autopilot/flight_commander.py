@@ -10,11 +10,10 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import commander
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
-from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
-from firmware_sim.autopilot.failsafes.supervisor import Supervisor
+from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention, Supervisor
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Guidance, Home
-from firmware_sim.autopilot.inputs import ModeRequest
+from firmware_sim.autopilot.modes.interface import ModeRequest
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 

@@ -17,9 +17,8 @@ from firmware_sim.autopilot.error_state import SIGMA, P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ModeRequest
 from firmware_sim.autopilot.modes import implementations
-from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
+from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, ModeRequest, here
 from firmware_sim.engine.record import Record
 
 # Bound once: looking up an enum member in every tick is slow.

@@ -11,7 +11,7 @@ from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot import autopilot_state
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import Sticks
+from firmware_sim.autopilot.modes.interface import Sticks
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans
 from firmware_sim.engine.record import POSITION, TRAJECTORY
 from firmware_sim.interfaces import BatterySample, GpsFix, Received

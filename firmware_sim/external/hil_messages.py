@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple, TypeAlias
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, US_PER_S
+from airl_mav.core.errors import PAGE
 from airl_mav.core.frames import Vector
-from airl_mav.core.unsupported import PAGE
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim import interfaces
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout

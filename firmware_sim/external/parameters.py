@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import PAGE, UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.core.unsupported import PAGE
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE, Corner, VehicleProfile
 from firmware_sim.interfaces import FirmwareMissingError

@@ -9,8 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.arena.ground import TOP, Relief, no_relief
+from airl_mav.arena.geometry import TOP, Arena, Relief, Shape, no_relief
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel

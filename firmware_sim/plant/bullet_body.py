@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.arena.ground import Ground
+from airl_mav.arena.geometry import Arena, Ground, Shape
 from airl_mav.core import frames
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.kernels import kernel

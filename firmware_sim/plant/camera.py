@@ -34,8 +34,8 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.projections import Renderer
+from airl_mav.profiles.vehicle import SensorNoise
 from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.plant.sensors import Rate
 

@@ -26,9 +26,8 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.projections import CameraKind
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import SensorNoise, load_vehicle
 from companion.frame_source import MESSAGES_PER_LOOK, ReceivedFrame, ZmqFrameSource
 from firmware_sim.plant.camera import CameraServer, SimulatedCamera
 from tests.support.flight_rig import quad

@@ -18,7 +18,7 @@ from firmware_sim.addons.extra_modes.collision_prevention import (
 )
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ObstacleBins, Source, Sticks
+from firmware_sim.autopilot.modes.interface import ObstacleBins, Source, Sticks
 from firmware_sim.autopilot.parameter_store import Parameters
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig

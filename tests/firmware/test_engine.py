@@ -22,7 +22,7 @@ from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import PositionYaw, Reposition
+from firmware_sim.autopilot.modes.interface import PositionYaw, Reposition
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
 from firmware_sim.mavlink.codec import message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result

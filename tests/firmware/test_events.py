@@ -40,7 +40,7 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
 )
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.flight_modes import Mode, Need
-from firmware_sim.autopilot.inputs import Source, Sticks
+from firmware_sim.autopilot.modes.interface import Source, Sticks
 from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect

@@ -15,10 +15,8 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
-from firmware_sim.addons.px4_hitl import board_link
 from firmware_sim.addons.px4_hitl import bridge as hitl
-from firmware_sim.addons.px4_hitl.board_link import BoardLink
-from firmware_sim.addons.px4_hitl.bridge import HitlBridge
+from firmware_sim.addons.px4_hitl.bridge import BoardLink, HitlBridge
 from firmware_sim.addons.px4_hitl.line import Router
 from firmware_sim.interfaces import (
     ActuatorControls,
@@ -139,7 +137,7 @@ def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
 
     peer.board.armed = True
     monkeypatch.setattr(peer.board, "idle", beat)
-    monkeypatch.setattr(board_link, "REBOOT_S", 2.0)
+    monkeypatch.setattr(hitl, "REBOOT_S", 2.0)
     bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareLostError, match=r"does not reboot.*MAV_RESULT_DENIED"):
         bridge.wait_connected(PATIENCE_S, alive)

@@ -16,8 +16,7 @@ from mavsdk.plugins.telemetry import Telemetry
 
 from airl_mav.core.clock import SimClock, WallClock
 from firmware_sim.addons.px4_hitl import bridge
-from firmware_sim.addons.px4_hitl.board_link import BoardLink
-from firmware_sim.addons.px4_hitl.bridge import HitlBridge
+from firmware_sim.addons.px4_hitl.bridge import BoardLink, HitlBridge
 from firmware_sim.addons.px4_hitl.line import Router
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode

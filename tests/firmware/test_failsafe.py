@@ -11,7 +11,7 @@ import pytest
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Result, Severity, Wire
 from firmware_sim.autopilot.commander import FlightPhase
-from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
+from firmware_sim.autopilot.failsafes.framework import LOOK_US
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint

@@ -15,7 +15,7 @@ from firmware_sim.addons.missions.items import NavCommand
 from firmware_sim.addons.missions.manager import destination
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import PositionYaw, Reposition
+from firmware_sim.autopilot.modes.interface import PositionYaw, Reposition
 from firmware_sim.autopilot.navigation.geofence import (
     FENCE_PERIOD_US,
     Circle,

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena, Obstacles
-from airl_mav.arena.ground import Ground
+from airl_mav.arena.geometry import Arena, Ground, Obstacles
 from airl_mav.core.constants import TICK_S
 from airl_mav.envs.arena_batch import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec

@@ -12,9 +12,8 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TAKEOFF_REACHED_M, US_PER_S
 from airl_mav.faults import Fault
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import WindSettings, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode

@@ -10,7 +10,13 @@ import pytest
 from airl_mav.core.frames import local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ManualControl, OrbitRequest, Reposition, Source, Sticks
+from firmware_sim.autopilot.modes.interface import (
+    ManualControl,
+    OrbitRequest,
+    Reposition,
+    Source,
+    Sticks,
+)
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.mavlink.codec import dialect
 from tests.support.kinematic_autopilot import ORIGIN

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local
-from firmware_sim.autopilot.inputs import Sticks
+from firmware_sim.autopilot.modes.interface import Sticks
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.status import CAPABILITIES, manual_control

@@ -7,8 +7,7 @@ import random
 
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.addons.missions.items import NavCommand, PlanFrame
-from firmware_sim.addons.missions.wire_items import belongs, parse
+from firmware_sim.addons.missions.items import NavCommand, PlanFrame, belongs, parse
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from tests.support.mission_kit import FakeFlight
 

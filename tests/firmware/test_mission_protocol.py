@@ -337,7 +337,7 @@ def test_what_px4_passes_over_in_silence(rig: Rig, message: Any) -> None:
 
 def test_checksum_is_px4s() -> None:
     """CRC-32 without inversions over a packed item, worked out bit by bit."""
-    from firmware_sim.addons.missions.wire_items import checksum
+    from firmware_sim.addons.missions.items import checksum
 
     def bitwise(data: bytes, crc: int) -> int:
         for byte in data:

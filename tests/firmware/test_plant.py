@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.frames import HOME, Vector
-from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import Sensors, VehicleProfile
+from airl_mav.profiles.vehicle import Sensors, VehicleProfile, WindSettings
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft, PlantName
 from airl_mav.vehicle import atmosphere as wind_module
 from airl_mav.vehicle.atmosphere import Wind

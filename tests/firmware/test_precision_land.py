@@ -11,7 +11,7 @@ from firmware_sim.addons.missions.items import NavCommand
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import LandingTarget
+from firmware_sim.autopilot.modes.interface import LandingTarget
 from firmware_sim.autopilot.navigation.plan import MissionType
 from firmware_sim.mavlink.codec import dialect
 from tests.support import mavlink_clients

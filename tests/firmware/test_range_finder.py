@@ -24,9 +24,9 @@ from firmware_sim.addons.flight_log import topics
 from firmware_sim.autopilot.autopilot_state import Clearance, Result
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import Source, Sticks
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.modes.automatic import landing_speed
+from firmware_sim.autopilot.modes.interface import Source, Sticks
 from firmware_sim.autopilot.modes.sticks import Piloting, TerrainHold
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.addons.px4_hitl.board_link import check_line
+from firmware_sim.addons.px4_hitl.bridge import check_line
 from firmware_sim.addons.px4_hitl.line import BUFFER_BYTES, SerialLostError, SerialPort
 from tests.support.hitl_peer import HitlPeer
 

@@ -21,8 +21,8 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import WindSettings
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.simulation import EpisodeSetup, Simulation

@@ -16,9 +16,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.faults import Fault
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import WindSettings, load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.commander import FlightPhase

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.conditions import Payload
+from airl_mav.profiles.vehicle import Payload
 from published import behaviour
 from published.behaviour import (
     Behaviour,

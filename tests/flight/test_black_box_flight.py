@@ -46,7 +46,7 @@ from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.addons.black_box.recorder import SAMPLE_US, open_recorder, run_of
-from companion.offboard_mission import MissionResult
+from companion.pilot import MissionResult
 from companion.program import prepare
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.lockstep_kit import demo_scenario, fly_as_companion

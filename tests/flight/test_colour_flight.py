@@ -19,8 +19,8 @@ from airl_mav.envs.observations import COMPILED
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.command_line import airl

@@ -6,9 +6,8 @@ import pytest
 
 from airl_mav import Scenario, rehearse
 from airl_mav.flight.judge import Outcome
-from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import LoadedRun, load, vehicle_of
 from airl_mav.report.measures import summarize_run
-from airl_mav.report.run_arenas import vehicle_of
 from airl_mav.report.run_tables import quality_table, setup_rows
 from tests.support.flown_here import flown_here
 

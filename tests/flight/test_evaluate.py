@@ -35,10 +35,9 @@ from airl_mav.policy.layouts import Encoded
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal import run_folder
-from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
+from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, arena_of, load
 from airl_mav.report import run_report
 from airl_mav.report.comparison import show
-from airl_mav.report.run_arenas import arena_of
 from airl_mav.report.run_report import write_report
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -29,7 +29,7 @@ from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from companion.frame_source import ZmqFrameSource
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import Mission, MissionResult, fly_mission
+from companion.pilot import Mission, MissionResult, fly_mission
 from companion.watchdog import ThreadGuard
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import (

@@ -17,8 +17,8 @@ from airl_mav.envs.spec import spec_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import LearnedPolicy
 from tests.support.lockstep_kit import demo_scenario
 
 SEED, ALTITUDE_M, HEIGHT_M, RADIUS_M, NORTH_M = 4, 2.0, 4.2, 1.0, 12.0

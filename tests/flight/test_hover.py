@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_US, US_PER_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 from tests.support.flight_rig import Rig, flight, quad
 
 SECONDS = 60.0

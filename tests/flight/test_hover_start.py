@@ -19,7 +19,7 @@ from airl_mav.rehearsal.firmware_process import episode_setup
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
-from companion.offboard_mission import MissionResult
+from companion.pilot import MissionResult
 from tests.support.lockstep_kit import SEED, demo_scenario, fly_as_companion
 
 AHEAD = 22

@@ -35,9 +35,8 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments.experiment import load_run
 from airl_mav.latency.injection import parse_latency
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import read_toml
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import WindSettings, load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.tracking import track
 from airl_mav.scenario.model import Scenario

@@ -14,7 +14,7 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.checks import TRANSPORT_US
-from companion.offboard_mission import MissionResult
+from companion.pilot import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode

@@ -29,16 +29,15 @@ from airl_mav.lockstep.stage import LockstepStage, ThreadPartner, newest
 from airl_mav.lockstep.turns import LANES, Handle, LockstepError, Turn
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
-from airl_mav.profiles.conditions import WindSettings
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import WindSettings, load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.resolve import ResolvedScenario
-from companion.conducted import Poll
 from companion.link_interface import BodyVelocity
-from companion.offboard_mission import Mission, fly_mission
-from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
+from companion.pilot import Mission, fly_mission
+from companion.watchdog import Poll
+from firmware_sim.autopilot.failsafes.framework import LOOK_US
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.simulation import EpisodeSetup
 from tests.support import lockstep_kit

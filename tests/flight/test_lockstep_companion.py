@@ -11,8 +11,8 @@ import pytest
 from airl_mav.addons.remote_lockstep.turns import TokenFrameSource, TokenTurns
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from companion.conducted import Abandoned, ConductedClock
 from companion.frame_source import ReceivedFrame
+from companion.watchdog import Abandoned, ConductedClock
 
 
 class ScriptedLink:

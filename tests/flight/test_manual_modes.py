@@ -11,7 +11,7 @@ from airl_mav.core.frames import quat_yaw
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import FollowedTarget, OrbitRequest, Source, Sticks
+from firmware_sim.autopilot.modes.interface import FollowedTarget, OrbitRequest, Source, Sticks
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
 
 CENTRED = Sticks(0.0, 0.0, 0.0, 0.0)

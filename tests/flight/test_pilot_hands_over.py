@@ -21,7 +21,7 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.scenario.checks import TRANSPORT_US
 from airl_mav.scenario.model import PilotSettings
-from companion.offboard_mission import MissionResult
+from companion.pilot import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase

@@ -36,7 +36,7 @@ from airl_mav.profiles.computer import existing_profile, load_computer, write_pr
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.scenario.checks import select_latency
 from airl_mav.scenario.model import DEFAULT_POLICY, Lateness
-from companion.offboard_mission import MissionResult
+from companion.pilot import MissionResult
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, allow_interrupt
 from tests.unit.test_companion_light import BLOCK

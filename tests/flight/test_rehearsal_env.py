@@ -27,7 +27,7 @@ from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
 from airl_mav.envs.registration import NAVIGATION
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.lockstep.lockstep_flight import fly
-from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.interfaces import FirmwareLostError

@@ -28,10 +28,9 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
-from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
-from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.policy.registry import LearnedPolicy, load_learned
+from airl_mav.profiles.vehicle import SensorNoise, load_vehicle
 from airl_mav.scenario.resolve import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.frame_source import open_named_camera

@@ -11,7 +11,7 @@ from airl_mav.core.frames import quat_yaw
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import PositionYaw, Reposition
+from firmware_sim.autopilot.modes.interface import PositionYaw, Reposition
 from tests.support.flight_rig import NAN, Rig, flight
 
 

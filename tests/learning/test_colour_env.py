@@ -20,8 +20,8 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.faults import Fault
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import boxes
-from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation_spec import ObservationSpec, Told
+from airl_mav.policy.registry import load_learned
 from airl_mav.profiles.projections import CHANNELS, CameraKind, Projection
 from airl_mav.scenario.model import Scenario
 from tests.support.policy_kit import export_tiny

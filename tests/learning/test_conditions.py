@@ -21,7 +21,7 @@ from airl_mav.envs.fleet_step import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.gym_flier import environment_of
-from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
+from airl_mav.profiles.vehicle import SensorNoise, Spread, WindSettings
 from airl_mav.rehearsal.firmware_process import aircraft_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario

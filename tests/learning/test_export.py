@@ -32,8 +32,8 @@ from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import load_card, open_model, read_card
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import boxes
-from airl_mav.policy.learned import decide, load_learned
 from airl_mav.policy.observation_spec import ObservationSpec
+from airl_mav.policy.registry import decide, load_learned
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training import onnx_export as export
 from airl_mav.training.export import export_sb3, network_of

@@ -20,7 +20,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.faults import Fault, check_gym
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario

@@ -25,8 +25,8 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.actions import ActionSpec, commands
-from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import load_learned
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import ExpertName, TrainingConfig

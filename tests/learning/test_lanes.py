@@ -18,9 +18,8 @@ from airl_mav.envs.arena_batch import ArenaBatch, batch_of
 from airl_mav.envs.fleet import LANES, Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.fleet_step import NAN3, REPEAT_US, advance
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.conditions import Spread
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import Spread, VehicleProfile
 from airl_mav.vehicle.airframe import (
     airframe_of,
     drag_force,

@@ -10,7 +10,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.images import scan_bytes
-from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import SensorNoise
 
 KNOBS = {
     "vehicle": "quad-lidar",

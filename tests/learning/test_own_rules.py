@@ -15,7 +15,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.actions import ActionSpec, commands
-from airl_mav.policy.learned import load_learned
+from airl_mav.policy.registry import load_learned
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.training.config import TrainingConfig

@@ -12,8 +12,7 @@ from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.fleet import Fleet, FlightStatus, Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.fleet_step import advance
-from airl_mav.profiles.conditions import Payload, loaded
-from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import Payload, VehicleProfile, load_vehicle, loaded
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, flight_power_w

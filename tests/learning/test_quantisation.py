@@ -18,7 +18,7 @@ from airl_mav.addons.int8.quantisation import (
 )
 from airl_mav.cli import main
 from airl_mav.policy.card import ONNX_FILE, PolicyCard, load_card, open_model
-from airl_mav.policy.learned import load_learned
+from airl_mav.policy.registry import load_learned
 from airl_mav.profiles.loading import profiles_dir
 
 DEFAULT = profiles_dir() / "policies" / "static-obstacles"

@@ -19,9 +19,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import ActionSpec, command, commands
 from airl_mav.policy.layouts import encode_layout
-from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
+from airl_mav.policy.registry import LearnedPolicy, load_learned
 from airl_mav.scenario.aircraft import Ports
 from airl_mav.training.algorithms import policy_arguments
 from airl_mav.training.config import NetworkSpec

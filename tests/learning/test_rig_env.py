@@ -18,7 +18,7 @@ from airl_mav.envs.spec import spec_of
 from airl_mav.faults import Fault
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
-from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import SensorNoise
 from firmware_sim.plant.camera import SimulatedCamera
 
 RIG = """

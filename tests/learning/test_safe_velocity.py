@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.addons.roofline.page import noticed_m
-from airl_mav.addons.roofline.stopping_flights import fly_into, greatest_speed
+from airl_mav.addons.roofline.page import fly_into, greatest_speed, noticed_m
 from airl_mav.core.errors import FieldError
 from airl_mav.envs import stopping
 from airl_mav.envs.fleet import FlightStatus
@@ -27,11 +26,10 @@ from airl_mav.envs.stopping import (
 )
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.latency.injection import longest_ms, parse_latency
-from airl_mav.policy.learned import load_learned
+from airl_mav.policy.registry import load_learned
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.conditions import Payload, loaded
 from airl_mav.profiles.loading import load_profile, profile_digest, profiles_dir
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import Payload, load_vehicle, loaded
 from airl_mav.training.config import TrainingConfig
 from tests.support.flight_rig import NAN, flight, velocity_setpoint
 from tests.support.processes import ROOT

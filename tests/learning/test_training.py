@@ -20,7 +20,7 @@ from airl_mav.core.progress import Progress
 from airl_mav.envs.evaluation import fly_episodes, success_rate
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import Encoded
-from airl_mav.policy.learned import load_learned
+from airl_mav.policy.registry import load_learned
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import load

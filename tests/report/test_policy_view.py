@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from airl_mav.policy.card import CARD_FILE
-from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import LoadedRun, arenas_of, load, vehicle_of
 from airl_mav.report.policy_view import SeenDecision, policy_again, seen_decisions
-from airl_mav.report.run_arenas import arenas_of, vehicle_of
 from tests.support.command_line import airl, option_words
 from tests.support.linear_policy import write_linear
 

@@ -13,8 +13,7 @@ import pytest
 
 from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.arena.ground import Ground
+from airl_mav.arena.geometry import Arena, Ground, Shape
 from airl_mav.flight.judge import Outcome
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

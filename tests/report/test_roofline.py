@@ -21,7 +21,7 @@ from airl_mav.addons.roofline.roofline import RooflineRequest, roofline
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
 from airl_mav.policy.card import Runtime, read_card
-from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
 

@@ -13,9 +13,8 @@ import numpy as np
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile, WindSettings
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.addons.auxiliary_estimation.auxiliary_aids import AuxiliaryAids
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot

@@ -38,7 +38,7 @@ from firmware_sim.autopilot.autopilot_state import (
 )
 from firmware_sim.autopilot.events.definition import MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import (
+from firmware_sim.autopilot.modes.interface import (
     FollowedTarget,
     LandingTarget,
     ModeRequest,

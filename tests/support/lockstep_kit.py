@@ -16,8 +16,7 @@ from airl_mav.rehearsal.observer import Observer
 from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
-from companion.offboard_mission import Mission, MissionResult, Start, fly_mission
-from companion.pilot import SentDecision
+from companion.pilot import Mission, MissionResult, SentDecision, Start, fly_mission
 
 SEED = 11
 """A short flight: two seconds to the goal."""

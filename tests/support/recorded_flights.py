@@ -25,7 +25,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.addons.black_box.recorder import SAMPLE_US, open_recorder, run_of
 from companion.link_interface import BatteryState, VehicleStatus
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import Mission, fly_mission
+from companion.pilot import Mission, fly_mission
 from companion.program import prepare
 from firmware_sim.simulation import EpisodeSetup, Simulation
 

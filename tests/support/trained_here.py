@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from airl_mav.policy.actions import AnyAction
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import LearnedPolicy
 from tests.support.command_line import airl
 
 

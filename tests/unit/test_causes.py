@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from airl_mav.addons.colour.profile import Appearance
-from airl_mav.addons.forensics.camera_view import bearing, nearest_spot, view_obstacle, view_wall
 from airl_mav.addons.forensics.long_flights import (
     MIN_TURNS,
     NO_CAUSE,
@@ -21,10 +20,14 @@ from airl_mav.addons.forensics.long_flights import (
 )
 from airl_mav.addons.forensics.worst import (
     USUAL,
+    bearing,
     cause_of,
     decisions_in_effect,
     examine_collision,
     hit_number,
+    nearest_spot,
+    view_obstacle,
+    view_wall,
 )
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape, Tour
 from airl_mav.camera.render import camera_pose

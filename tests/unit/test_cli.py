@@ -18,7 +18,7 @@ from airl_mav.cli.list_command import KINDS
 from airl_mav.cli.main import GROUPS, main, subcommands
 from airl_mav.cli.options import _arguments
 from airl_mav.core import fields
-from airl_mav.core.unsupported import PAGE
+from airl_mav.core.errors import PAGE
 from airl_mav.policy.registry import policy_names
 from airl_mav.profiles.loading import list_profiles
 from tests.support.processes import ROOT

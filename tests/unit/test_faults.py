@@ -26,9 +26,8 @@ from airl_mav.faults import (
     window_us,
 )
 from airl_mav.profiles.loading import read_toml
-from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.model import Scenario, save_scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.scenario_file import save_scenario
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 
 TIMES = st.floats(min_value=0.0, max_value=99_999.0, allow_nan=False)

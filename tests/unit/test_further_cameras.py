@@ -20,9 +20,8 @@ from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.registry import PolicyInfo, camera_refused
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Camera, check_gym_imaging, check_noise, check_renderer
-from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.loading import list_profiles, load_profile
-from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import SensorNoise, VehicleProfile, load_vehicle
 from companion.limits import ground_in_view
 from firmware_sim.plant.camera import SimulatedCamera
 

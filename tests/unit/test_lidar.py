@@ -19,8 +19,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.envs.spec import CameraChange
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.profiles.camera import Camera, Ranging
-from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import SensorNoise, load_vehicle
 from companion.addons.vehicle_reports.reports import UNKNOWN_CM, obstacle_distance
 from tests.unit.test_scans import posts
 

@@ -7,8 +7,7 @@ import pytest
 
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.computer import ComputerProfile, load_computer
-from airl_mav.profiles.conditions import Payload, loaded
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import Payload, load_vehicle, loaded
 from airl_mav.rehearsal.channel import Begin
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

@@ -20,8 +20,7 @@ from airl_mav.core.plugins import DOORS, POLICIES, load_part, names_code
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.policy.registry import find_policy, load_policy
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.scenario_file import anchored
+from airl_mav.scenario.model import Scenario, anchored
 from airl_mav.training.config import TrainingConfig
 
 POLICY = '''

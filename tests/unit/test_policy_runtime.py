@@ -24,22 +24,28 @@ from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy import learned, registry
+from airl_mav.policy import registry
 from airl_mav.policy.actions import Action, ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, PolicyCard, Runtime, TorchRuntime, read_card
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import encode_layout
-from airl_mav.policy.learned import LearnedPolicy, decide, load_learned
 from airl_mav.policy.observation import Kinematics, Observation, encode
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.registry import find_policy, load_policy, policy_names
+from airl_mav.policy.registry import (
+    LearnedPolicy,
+    decide,
+    find_policy,
+    load_learned,
+    load_policy,
+    policy_names,
+)
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.scenario.checks import decide_piloting, select_latency
 from airl_mav.scenario.model import DEFAULT_POLICY, Decisions, PilotSettings, Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.frame_source import ReceivedFrame
-from companion.offboard_mission import check_camera
+from companion.pilot import check_camera
 from tests.support.policy_kit import SPEC, export_tiny, noise
 from tests.support.processes import SITL_WITHOUT_REPORT, run_alone, running
 
@@ -124,7 +130,7 @@ def test_a_torch_program_runs_only_when_its_maker_is_trusted(
     # A policy that is shipped with the package.
     (folder.parent / "policies").mkdir()
     shipped = folder.rename(folder.parent / "policies" / folder.name)
-    monkeypatch.setattr(learned, "profiles_dir", lambda: shipped.parents[1])
+    monkeypatch.setattr(registry, "profiles_dir", lambda: shipped.parents[1])
     assert load_learned(shipped, runtime="torch").card.name
 
 
@@ -522,7 +528,7 @@ sys.meta_path.insert(0, Absent())
 
 import math
 import numpy as np
-import companion.offboard_mission, companion.pilot, airl_mav.cli.companion_command as cli
+import companion.pilot, companion.pilot, airl_mav.cli.companion_command as cli
 from companion.program import prepare
 assert "onnxruntime" not in sys.modules, "nobody asked for a network yet"
 policy = prepare(cli.OPTIONS(policy={folder!r})).policy

@@ -14,7 +14,7 @@ from airl_mav.addons.colour import picture
 from airl_mav.addons.colour.picture import ColourArrays, Picture, render_picture
 from airl_mav.addons.colour.shading import MATT, Gloss
 from airl_mav.arena.generate import generate
-from airl_mav.arena.ground import no_relief
+from airl_mav.arena.geometry import no_relief
 from airl_mav.camera import render as depth_images
 from airl_mav.camera.bvh import Meshes, forest_of, meshes_of, placed_in
 from airl_mav.camera.intrinsics import Intrinsics

@@ -18,12 +18,11 @@ from airl_mav.cli.companion_command import CompanionOptions
 from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
-from airl_mav.profiles.conditions import Payload, WindSettings
 from airl_mav.profiles.loading import read_toml
+from airl_mav.profiles.vehicle import Payload, WindSettings
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.model import Scenario, anchored, save_scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
-from airl_mav.scenario.scenario_file import anchored, save_scenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
 from tests.support.processes import ROOT
 

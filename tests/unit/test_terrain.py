@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from airl_mav.addons.colour.picture import render_picture
 from airl_mav.arena.generate import generate, local_bounds
-from airl_mav.arena.geometry import Arena, Obstacles, Shape
-from airl_mav.arena.ground import Ground, no_relief
+from airl_mav.arena.geometry import Arena, Ground, Obstacles, Shape, no_relief
 from airl_mav.arena.placed_assets import _problem
 from airl_mav.arena.placement import Boxes, Hills, bounding_half, raster_passage
 from airl_mav.arena.relief import draw_ground, extreme_within, plane_at, stand_on

@@ -30,8 +30,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.run_arenas import trust_arenas
+from airl_mav.rehearsal.run_folder import load, trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
 SAMPLES = {"raycast": 16, "mitsuba": 64}

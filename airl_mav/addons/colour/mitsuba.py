@@ -20,8 +20,7 @@ from airl_mav.addons.colour import appearance
 from airl_mav.addons.colour.picture import grey
 from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.addons.colour.textures import mean_of, periods, texels
-from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
-from airl_mav.arena.ground import Ground
+from airl_mav.arena.geometry import Arena, Ground, PlacedMesh, Shape
 from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.render import RANGE_M

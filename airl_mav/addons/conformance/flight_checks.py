@@ -7,15 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from airl_mav.addons.conformance.checklist import (
-    CheckDefinition,
-    LandedState,
-    MavCommand,
-    MavFrame,
-    Reaction,
-    name_of,
-    require,
-)
+from airl_mav.addons.conformance import checklist
 from airl_mav.addons.conformance.ground_checks import TEXT_S, require_answer
 from airl_mav.addons.conformance.telemetry import STOP_BODY, STOP_NED, StepSetpoint
 from airl_mav.addons.conformance.vehicle import (
@@ -71,15 +63,19 @@ def takeoff(vehicle: VehicleConnection, altitude_m: float) -> str:
         return climbed and abs(vehicle.velocity_m_s[2]) < STANDING_M_S
 
     climbed = vehicle.wait_for(arrived, CLIMB_S)
-    require(climbed, f"{vehicle.height_m - start_m:.1f} m after {CLIMB_S:g} s")
+    checklist.require(climbed, f"{vehicle.height_m - start_m:.1f} m after {CLIMB_S:g} s")
     took_s = vehicle.telemetry.boot_s - start_s
-    in_air = vehicle.wait_for(lambda: vehicle.landed_state == LandedState.IN_AIR, MODE_S)
+    in_air = vehicle.wait_for(lambda: vehicle.landed_state == checklist.LandedState.IN_AIR, MODE_S)
     right_mode = vehicle.reaches_mode(vehicle.autopilot.after_takeoff_mode)
     phases = vehicle.telemetry.landed_states
     finding = f"{vehicle.height_m - start_m:.1f} m after {took_s:.1f} s, {_names(phases)}"
-    expected = [LandedState.ON_GROUND, LandedState.TAKEOFF, LandedState.IN_AIR]
-    require(in_air and phases[-3:] == expected, finding)
-    require(right_mode, f"{finding}; mode {vehicle.mode_name}")
+    expected = [
+        checklist.LandedState.ON_GROUND,
+        checklist.LandedState.TAKEOFF,
+        checklist.LandedState.IN_AIR,
+    ]
+    checklist.require(in_air and phases[-3:] == expected, finding)
+    checklist.require(right_mode, f"{finding}; mode {vehicle.mode_name}")
     return f"{finding}, {vehicle.mode_name}"
 
 
@@ -89,7 +85,7 @@ def start_offboard(vehicle: VehicleConnection, setpoint: StepSetpoint) -> None:
     vehicle.call("offboard.start()", vehicle.offboard.start, must_succeed=True)
     expected = vehicle.autopilot.mode_name(vehicle.autopilot.offboard_mode)
     offboard = vehicle.reaches_mode(vehicle.autopilot.offboard_mode)
-    require(offboard, f"mode {vehicle.mode_name}, not {expected} within {MODE_S:g} s")
+    checklist.require(offboard, f"mode {vehicle.mode_name}, not {expected} within {MODE_S:g} s")
 
 
 # --- commands and velocities by MAVSDK
@@ -101,19 +97,19 @@ def _offboard_without_setpoint(vehicle: VehicleConnection) -> str:
     finding = require_answer(vehicle, result, vehicle.autopilot.offboard_in_air, since)
     vehicle.wait(TEXT_S)
     if result:
-        require(vehicle.mode == mode, f"{finding}, and the mode changed")
+        checklist.require(vehicle.mode == mode, f"{finding}, and the mode changed")
         finding += ", no change of mode"
     speed_m_s = vehicle.speed_m_s
-    require(speed_m_s < STANDING_M_S, f"{finding}; it moves at {speed_m_s:.2f} m/s")
+    checklist.require(speed_m_s < STANDING_M_S, f"{finding}; it moves at {speed_m_s:.2f} m/s")
     return finding
 
 
 def _disarm(vehicle: VehicleConnection) -> str:
     since = len(vehicle.telemetry.texts)
-    result = vehicle.command(MavCommand.COMPONENT_ARM_DISARM, 0.0, note="disarm")
+    result = vehicle.command(checklist.MavCommand.COMPONENT_ARM_DISARM, 0.0, note="disarm")
     finding = require_answer(vehicle, result, vehicle.autopilot.disarm_in_air, since)
     vehicle.wait(TEXT_S)
-    require(vehicle.armed, f"{finding}, and it disarmed")
+    checklist.require(vehicle.armed, f"{finding}, and it disarmed")
     return finding
 
 
@@ -142,7 +138,7 @@ def _velocity(
     vehicle.wait(FLY_S)
     mean = vehicle.telemetry.recent(1.0).velocity.mean(axis=0)
     finding = f"({mean[0]:.2f}, {mean[1]:.2f}, {mean[2]:.2f}) m/s north, east, down"
-    require(np.abs(mean - expected).max() < VELOCITY_M_S, f"{finding}, not {expected}")
+    checklist.require(np.abs(mean - expected).max() < VELOCITY_M_S, f"{finding}, not {expected}")
     return finding
 
 
@@ -158,8 +154,8 @@ def _start_raw(vehicle: VehicleConnection) -> str:
 
 def _request_offboard(vehicle: VehicleConnection) -> None:
     """Enter offboard with a stream of raw setpoints. Raises CheckFailedError."""
-    require(vehicle.set_mode(vehicle.autopilot.offboard, "raw setpoints") == 0, "refused")
-    require(vehicle.reaches_mode(vehicle.autopilot.offboard_mode), "no change of mode")
+    checklist.require(vehicle.set_mode(vehicle.autopilot.offboard, "raw setpoints") == 0, "refused")
+    checklist.require(vehicle.reaches_mode(vehicle.autopilot.offboard_mode), "no change of mode")
 
 
 def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: VehicleConnection) -> str:
@@ -167,7 +163,7 @@ def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: VehicleConnec
     frame, mask = setpoint.frame, setpoint.mask
     expected = vehicle.autopilot.frames[frame]
     if mask != VELOCITY:
-        expected = vehicle.autopilot.ignore_all if mask == IGNORE_ALL else Reaction.FLOWN
+        expected = vehicle.autopilot.ignore_all if mask == IGNORE_ALL else checklist.Reaction.FLOWN
     telemetry = vehicle.telemetry
     start_s, since = telemetry.boot_s, len(telemetry.texts)
     vehicle.transcript.add(
@@ -181,22 +177,22 @@ def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: VehicleConnec
     motion = telemetry.recent(OBSERVE_S + 1.0).between(start_s, telemetry.boot_s)
     change = motion.velocity[:, :2] - motion.velocity[0, :2]
     # Facing east, forward is east.
-    axis = 0 if frame in (MavFrame.LOCAL_NED, MavFrame.LOCAL_OFFSET_NED) else 1
+    axis = 0 if frame in (checklist.MavFrame.LOCAL_NED, checklist.MavFrame.LOCAL_OFFSET_NED) else 1
     along, across = change[:, axis].max(), np.abs(change[:, 1 - axis]).max()
     refusal = telemetry.find_text("SET_POSITION_TARGET_LOCAL_NED", since)
     vehicle.wait(RECOVER_S)
     moved = f"{along:.2f} m/s {('north', 'east')[axis]}"
     if along > VELOCITY_M_S > across:
-        reaction, finding = Reaction.FLOWN, f"flown, {moved}"
+        reaction, finding = checklist.Reaction.FLOWN, f"flown, {moved}"
     elif refusal is not None:
-        reaction, finding = Reaction.REFUSED, f'refused, "{refusal.text}"'
+        reaction, finding = checklist.Reaction.REFUSED, f'refused, "{refusal.text}"'
     else:
-        reaction, finding = Reaction.IGNORED, f"ignored, {moved}"
-    require(
-        (reaction is Reaction.FLOWN) == (along > VELOCITY_M_S),
+        reaction, finding = checklist.Reaction.IGNORED, f"ignored, {moved}"
+    checklist.require(
+        (reaction is checklist.Reaction.FLOWN) == (along > VELOCITY_M_S),
         f"{finding}: {moved}, {across:.2f} m/s across",
     )
-    require(reaction is expected, f"{finding}; expected: {expected.value}")
+    checklist.require(reaction is expected, f"{finding}; expected: {expected.value}")
     return finding
 
 
@@ -206,19 +202,19 @@ def _nan_velocity(stream: SetpointStream, vehicle: VehicleConnection) -> str:
     The check uses the last second's mean velocity: ArduCopter restarts its mode with each such
     setpoint and swings by up to 0.6 m/s.
     """
-    stream.send(RawSetpoint(MavFrame.LOCAL_NED, VELOCITY, vx=None))
+    stream.send(RawSetpoint(checklist.MavFrame.LOCAL_NED, VELOCITY, vx=None))
     vehicle.transcript.add("sent", "SET_POSITION_TARGET_LOCAL_NED vx NaN for 2 s")
     vehicle.wait(RECOVER_S)
     mode, mode_name = vehicle.mode, vehicle.mode_name
     position = vehicle.telemetry.recent(RECOVER_S / 2).position
-    require(len(position) > 1, "no LOCAL_POSITION_NED")
+    checklist.require(len(position) > 1, "no LOCAL_POSITION_NED")
     moved = position[-1] - position[0]
     north, east, down = moved[1:4] / moved[0]
     stream.send(FACING_EAST)
     vehicle.wait(RECOVER_S / 2)
     finding = f"{mode_name}, ({north:.2f}, {east:.2f}, {down:.2f}) m/s"
     stands = math.hypot(north, east, down) < STANDING_M_S
-    require(mode == vehicle.autopilot.offboard_mode and stands, finding)
+    checklist.require(mode == vehicle.autopilot.offboard_mode and stands, finding)
     return finding
 
 
@@ -232,7 +228,7 @@ def _lose_setpoints(vehicle: VehicleConnection) -> str:
         _request_offboard(vehicle)
         vehicle.wait(2.0 * FLY_S)
         cruise = float(telemetry.recent(1.0).velocity[:, 0].mean())
-        require(
+        checklist.require(
             abs(cruise - CRUISE_M_S) < VELOCITY_M_S,
             f"{cruise:.2f} m/s before it, not {CRUISE_M_S:g}",
         )
@@ -246,19 +242,19 @@ def _lose_setpoints(vehicle: VehicleConnection) -> str:
     wait_s = latest_s + LOSS_MARGIN_S
     if expected.text:
         text = vehicle.wait_for(lambda: telemetry.find_text(expected.text, since), wait_s)
-        require(text, f'no "{expected.text}" in {wait_s:g} s')
+        checklist.require(text, f'no "{expected.text}" in {wait_s:g} s')
         reaction_s, how = text.boot_s - last_s, f'"{text.text}"'
     else:
         vehicle.wait(wait_s)
         motion = telemetry.recent(wait_s + 1.0).between(last_s, math.inf)
         north = motion.velocity[:, 0]
         slower = np.flatnonzero(north < BRAKING * cruise)
-        require(slower.size, f"flies on at {north[-1]:.2f} m/s after {wait_s:g} s")
+        checklist.require(slower.size, f"flies on at {north[-1]:.2f} m/s after {wait_s:g} s")
         reaction_s, how = float(motion.position[slower[0], 0]) - last_s, "brakes"
     right_mode = vehicle.reaches_mode(expected.mode)
     finding = f"{how} {reaction_s:.2f} s after the last setpoint, {vehicle.mode_name}"
     finding += f", {_motion_after_loss(vehicle, cruise)}"
-    require(
+    checklist.require(
         right_mode and earliest_s - TEXT_TIME_S <= reaction_s <= latest_s + TEXT_TIME_S,
         f"{finding}; expected: {earliest_s:g} to {latest_s:g} s, "
         f"{vehicle.autopilot.mode_name(expected.mode)}",
@@ -274,13 +270,13 @@ def _motion_after_loss(vehicle: VehicleConnection, cruise: float) -> str:
 
     if not vehicle.autopilot.loss.descends:
         stands = vehicle.wait_for(lambda: level_m_s() < STANDING_M_S, STOP_S)
-        require(stands, f"still moves at {level_m_s():.2f} m/s")
+        checklist.require(stands, f"still moves at {level_m_s():.2f} m/s")
         return "stands"
     vehicle.wait(FLY_S)
     down = float(vehicle.telemetry.recent(1.0).velocity[:, 2].mean())
     finding = f"{level_m_s():.2f} m/s level and {down:.2f} m/s down after {FLY_S:g} s"
     slowest, fastest = DESCENT_M_S
-    require(slowest < down < fastest and level_m_s() < BRAKING * cruise, finding)
+    checklist.require(slowest < down < fastest and level_m_s() < BRAKING * cruise, finding)
     return finding
 
 
@@ -291,7 +287,7 @@ def _resume_setpoints(vehicle: VehicleConnection) -> str:
         vehicle.wait(FLY_S)
         north = float(vehicle.telemetry.recent(0.5).velocity[:, 0].mean())
     finding = f"{vehicle.mode_name}, {north:.2f} m/s"
-    require(offboard and abs(north - CRUISE_M_S) < VELOCITY_M_S, finding)
+    checklist.require(offboard and abs(north - CRUISE_M_S) < VELOCITY_M_S, finding)
     return finding
 
 
@@ -306,16 +302,18 @@ def hold(vehicle: VehicleConnection) -> str:
     autopilot = vehicle.autopilot
     expected = " or ".join(map(autopilot.mode_name, autopilot.hold_modes))
     holds = vehicle.reaches_mode(*autopilot.hold_modes)
-    require(holds, f"mode {vehicle.mode_name}, not {expected}")
+    checklist.require(holds, f"mode {vehicle.mode_name}, not {expected}")
     start_s = vehicle.telemetry.boot_s
     stands = vehicle.wait_for(lambda: vehicle.speed_m_s < STANDING_M_S, STOP_S)
-    require(stands, f"{vehicle.mode_name}: {vehicle.speed_m_s:.2f} m/s after {STOP_S:g} s")
+    checklist.require(
+        stands, f"{vehicle.mode_name}: {vehicle.speed_m_s:.2f} m/s after {STOP_S:g} s"
+    )
     stopped_s = vehicle.telemetry.boot_s - start_s
     vehicle.wait(FLY_S)
     places = vehicle.telemetry.recent(FLY_S).position[:, 1:4]
     drift_m = float(np.linalg.norm(places - places[-1], axis=1).max())
     finding = f"{vehicle.mode_name}, stands after {stopped_s:.1f} s, drifts {drift_m:.2f} m"
-    require(drift_m < DRIFT_M, f"{finding} in {FLY_S:g} s")
+    checklist.require(drift_m < DRIFT_M, f"{finding} in {FLY_S:g} s")
     return finding
 
 
@@ -326,49 +324,61 @@ def _land(vehicle: VehicleConnection) -> str:
     vehicle.call("action.land()", vehicle.action.land, must_succeed=True)
     mode = vehicle.autopilot.land_mode
     right_mode = vehicle.reaches_mode(mode)
-    landed = vehicle.wait_for(lambda: vehicle.landed_state == LandedState.ON_GROUND, longest_s)
-    require(landed, f"not on the ground after {longest_s:.0f} s")
+    landed = vehicle.wait_for(
+        lambda: vehicle.landed_state == checklist.LandedState.ON_GROUND, longest_s
+    )
+    checklist.require(landed, f"not on the ground after {longest_s:.0f} s")
     phases = telemetry.landed_states[before:]
     finding = f"{_names(phases)} after {telemetry.boot_s - start_s:.1f} s"
-    require(right_mode, f"{finding}; it was never in {vehicle.autopilot.mode_name(mode)}")
-    require(phases[-2:] == [LandedState.LANDING, LandedState.ON_GROUND], finding)
+    checklist.require(right_mode, f"{finding}; it was never in {vehicle.autopilot.mode_name(mode)}")
+    checklist.require(
+        phases[-2:] == [checklist.LandedState.LANDING, checklist.LandedState.ON_GROUND], finding
+    )
     return finding
 
 
 def _auto_disarm(vehicle: VehicleConnection) -> str:
     start_s = vehicle.telemetry.boot_s
-    require(vehicle.wait_for(lambda: not vehicle.armed, DISARM_S), f"armed after {DISARM_S:g} s")
+    checklist.require(
+        vehicle.wait_for(lambda: not vehicle.armed, DISARM_S), f"armed after {DISARM_S:g} s"
+    )
     vehicle.may_be_armed = False
     return f"disarmed by itself {vehicle.telemetry.boot_s - start_s:.1f} s after landing"
 
 
 def _names(phases: list[int]) -> str:
-    return " -> ".join(name_of(LandedState, phase) for phase in phases)
+    return " -> ".join(checklist.name_of(checklist.LandedState, phase) for phase in phases)
 
 
 OFFBOARD_CHECKS = (
-    CheckDefinition("offboard without setpoint, in the air", _offboard_without_setpoint),
-    CheckDefinition("disarming in the air", _disarm),
-    CheckDefinition("offboard NED", _offboard_ned),
-    CheckDefinition("offboard body", _offboard_body),
+    checklist.CheckDefinition("offboard without setpoint, in the air", _offboard_without_setpoint),
+    checklist.CheckDefinition("disarming in the air", _disarm),
+    checklist.CheckDefinition("offboard NED", _offboard_ned),
+    checklist.CheckDefinition("offboard body", _offboard_body),
 )
 LOSS_CHECKS = (
-    CheckDefinition("offboard loss", _lose_setpoints, essential=True),
-    CheckDefinition("setpoints resume", _resume_setpoints),
+    checklist.CheckDefinition("offboard loss", _lose_setpoints, essential=True),
+    checklist.CheckDefinition("setpoints resume", _resume_setpoints),
 )
 LANDING_CHECKS = (
-    CheckDefinition("land", _land, essential=True, for_steps=True),
-    CheckDefinition("auto-disarm", _auto_disarm, for_steps=True),
+    checklist.CheckDefinition("land", _land, essential=True, for_steps=True),
+    checklist.CheckDefinition("auto-disarm", _auto_disarm, for_steps=True),
 )
 
 
-def setpoint_checks(stream: SetpointStream) -> list[CheckDefinition]:
+def setpoint_checks(stream: SetpointStream) -> list[checklist.CheckDefinition]:
     """Return the checks of raw setpoints, facing east, so that forward is not north."""
-    probes = {f"frame {each:d} {each.name}": RawSetpoint(each, VELOCITY, 1.0) for each in MavFrame}
+    probes = {
+        f"frame {each:d} {each.name}": RawSetpoint(each, VELOCITY, 1.0)
+        for each in checklist.MavFrame
+    }
     for mask in (VELOCITY_FORCE_BIT, IGNORE_ALL):
-        probes[f"mask {mask:#x}"] = RawSetpoint(MavFrame.LOCAL_NED, mask, 1.0)
+        probes[f"mask {mask:#x}"] = RawSetpoint(checklist.MavFrame.LOCAL_NED, mask, 1.0)
     return [
-        CheckDefinition("raw setpoints", _start_raw, essential=True),
-        *(CheckDefinition(name, partial(_react, stream, each)) for name, each in probes.items()),
-        CheckDefinition("NaN velocity", partial(_nan_velocity, stream)),
+        checklist.CheckDefinition("raw setpoints", _start_raw, essential=True),
+        *(
+            checklist.CheckDefinition(name, partial(_react, stream, each))
+            for name, each in probes.items()
+        ),
+        checklist.CheckDefinition("NaN velocity", partial(_nan_velocity, stream)),
     ]

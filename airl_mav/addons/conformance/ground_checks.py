@@ -5,21 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from airl_mav.addons.conformance.checklist import (
-    CUSTOM_MODE_FLAG,
-    PREARM_CHECK,
-    UNKNOWN_COMMAND,
-    VEHICLE_TYPES,
-    CheckDefinition,
-    CheckFailedError,
-    ExpectedAnswer,
-    MavCommand,
-    MavResult,
-    NotApplicableError,
-    name_of,
-    require,
-    version_name,
-)
+from airl_mav.addons.conformance import checklist
 from airl_mav.addons.conformance.telemetry import Fields
 from airl_mav.addons.conformance.vehicle import Method, VehicleConnection
 from airl_mav.core.clock import WallClock
@@ -52,42 +38,47 @@ def heartbeat(vehicle: VehicleConnection) -> str:
     """Wait for a heartbeat, and expect its autopilot's behaviour in later checks."""
     beat = _first(vehicle, "HEARTBEAT")
     vehicle.expect_autopilot(beat["autopilot"])
-    kind = VEHICLE_TYPES.get(beat["type"], "vehicle")
+    kind = checklist.VEHICLE_TYPES.get(beat["type"], "vehicle")
     title = vehicle.autopilot.title
     who = f"{title} (autopilot {beat['autopilot']}), {kind} (type {beat['type']})"
-    require(not vehicle.armed, f"{who}: it is armed already: disarm it first")
+    checklist.require(not vehicle.armed, f"{who}: it is armed already: disarm it first")
     return f"{who}, {vehicle.mode_name}, disarmed"
 
 
 def require_answer(
-    vehicle: VehicleConnection, result: int, expected: ExpectedAnswer, since: int
+    vehicle: VehicleConnection, result: int, expected: checklist.ExpectedAnswer, since: int
 ) -> str:
     """Return the finding of the expected MAV_RESULT. Raises CheckFailedError for others."""
-    name = name_of(MavResult, result)
-    require(result == expected.result, f"{name}, not {expected.result.name}")
+    name = checklist.name_of(checklist.MavResult, result)
+    checklist.require(result == expected.result, f"{name}, not {expected.result.name}")
     if not expected.text:
         return name
     heard = vehicle.wait_for(lambda: vehicle.telemetry.find_text(expected.text, since), TEXT_S)
-    require(heard, f'{name} without "{expected.text}"')
+    checklist.require(heard, f'{name} without "{expected.text}"')
     return f'{name}, "{heard.text}"'
 
 
 def _version(vehicle: VehicleConnection) -> str:
     # MAVSDK requests it when it connects.
     if vehicle.telemetry.latest("AUTOPILOT_VERSION") is None:
-        vehicle.command(MavCommand.REQUEST_MESSAGE, AUTOPILOT_VERSION_ID, note="AUTOPILOT_VERSION")
+        vehicle.command(
+            checklist.MavCommand.REQUEST_MESSAGE, AUTOPILOT_VERSION_ID, note="AUTOPILOT_VERSION"
+        )
     fields = _first(vehicle, "AUTOPILOT_VERSION")
     capabilities = fields["capabilities"]
-    finding = f"version {version_name(fields['flight_sw_version'])}, capabilities {capabilities:#x}"
+    version = checklist.version_name(fields["flight_sw_version"])
+    finding = f"version {version}, capabilities {capabilities:#x}"
     missing = [name for bit, name in NEEDED_CAPABILITIES.items() if not capabilities & bit]
-    require(not missing, f"{finding}: without {', '.join(missing)}")
+    checklist.require(not missing, f"{finding}: without {', '.join(missing)}")
     return finding
 
 
 def _clock(vehicle: VehicleConnection) -> str:
     method = vehicle.clock.choose_method()
     if method is Method.TELEMETRY:
-        raise NotApplicableError("neither TIMESYNC nor SYSTEM_TIME is answered: times are coarse")
+        raise checklist.NotApplicableError(
+            "neither TIMESYNC nor SYSTEM_TIME is answered: times are coarse"
+        )
     return f"read from {method.value}"
 
 
@@ -98,7 +89,9 @@ def _unasked_streams(vehicle: VehicleConnection) -> str:
     vehicle.transcript.add("note", f"unasked [Hz]: {listed or 'nothing'}")
     total = f"{sum(rates.values()):.0f} messages a second unasked"
     if vehicle.url.startswith("serial"):
-        raise NotApplicableError(f"{total}; what a serial link carries is a setting of its port")
+        raise checklist.NotApplicableError(
+            f"{total}; what a serial link carries is a setting of its port"
+        )
     _require_rates(counts, elapsed_s, vehicle.unasked_hz, f"{total}: ")
     return f"{total}, as stored"
 
@@ -107,8 +100,13 @@ def _ask_streams(vehicle: VehicleConnection) -> str:
     for name, (number, rate_hz) in ASKED_HZ.items():
         period_us = round(US_PER_S / rate_hz)
         note = f"{name} {rate_hz:g} Hz"
-        result = vehicle.command(MavCommand.SET_MESSAGE_INTERVAL, number, period_us, note=note)
-        require(result == 0, f"{name} at {rate_hz:g} Hz: {name_of(MavResult, result)}")
+        result = vehicle.command(
+            checklist.MavCommand.SET_MESSAGE_INTERVAL, number, period_us, note=note
+        )
+        checklist.require(
+            result == 0,
+            f"{name} at {rate_hz:g} Hz: {checklist.name_of(checklist.MavResult, result)}",
+        )
     return ", ".join(f"{name} {rate:g} Hz" for name, (_, rate) in ASKED_HZ.items()) + " accepted"
 
 
@@ -118,7 +116,7 @@ def _ready(vehicle: VehicleConnection) -> str:
     while True:
         now_us = stopwatch.time_us()
         status = telemetry.latest("SYS_STATUS") or {}
-        ready = status.get("onboard_control_sensors_health", 0) & PREARM_CHECK
+        ready = status.get("onboard_control_sensors_health", 0) & checklist.PREARM_CHECK
         if not ready or telemetry.latest("LOCAL_POSITION_NED") is None:
             ready_us = None
         elif ready_us is None:
@@ -127,7 +125,9 @@ def _ready(vehicle: VehicleConnection) -> str:
             return f"after {ready_us / US_PER_S:.1f} s"
         if now_us > READY_S * US_PER_S:
             text = telemetry.texts[-1].text if telemetry.texts else "none"
-            raise CheckFailedError(f"not ready to arm after {READY_S:g} s; last STATUSTEXT: {text}")
+            raise checklist.CheckFailedError(
+                f"not ready to arm after {READY_S:g} s; last STATUSTEXT: {text}"
+            )
         vehicle.poll()
 
 
@@ -138,22 +138,28 @@ def _asked_streams(vehicle: VehicleConnection) -> str:
 
 
 def _unknown_command(vehicle: VehicleConnection) -> str:
-    result = vehicle.command(UNKNOWN_COMMAND)
-    return require_answer(vehicle, result, ExpectedAnswer(MavResult.UNSUPPORTED), 0)
+    result = vehicle.command(checklist.UNKNOWN_COMMAND)
+    return require_answer(
+        vehicle, result, checklist.ExpectedAnswer(checklist.MavResult.UNSUPPORTED), 0
+    )
 
 
 def _unknown_mode(vehicle: VehicleConnection) -> str:
     mode, since = vehicle.mode, len(vehicle.telemetry.texts)
-    result = vehicle.command(MavCommand.DO_SET_MODE, CUSTOM_MODE_FLAG, UNKNOWN_MAIN_MODE)
+    result = vehicle.command(
+        checklist.MavCommand.DO_SET_MODE, checklist.CUSTOM_MODE_FLAG, UNKNOWN_MAIN_MODE
+    )
     vehicle.wait(TEXT_S)
     finding = require_answer(vehicle, result, vehicle.autopilot.unknown_mode, since)
-    require(vehicle.mode == mode, f"{finding}, and the mode changed")
+    checklist.require(vehicle.mode == mode, f"{finding}, and the mode changed")
     return f"{finding}, no change of mode"
 
 
 def _offboard_without_setpoint(vehicle: VehicleConnection) -> str:
     local = vehicle.call("offboard.start()", vehicle.offboard.start)
-    require(local == "NO_SETPOINT_SET", f"MAVSDK: {local or 'SUCCESS'}, not NO_SETPOINT_SET")
+    checklist.require(
+        local == "NO_SETPOINT_SET", f"MAVSDK: {local or 'SUCCESS'}, not NO_SETPOINT_SET"
+    )
     autopilot, since = vehicle.autopilot, len(vehicle.telemetry.texts)
     result = vehicle.set_mode(autopilot.offboard, "no setpoint")
     answer = require_answer(vehicle, result, autopilot.offboard_on_ground, since)
@@ -164,7 +170,7 @@ def _offboard_without_setpoint(vehicle: VehicleConnection) -> str:
     vehicle.set_mode(autopilot.hold, "back")
     vehicle.reaches_mode(*autopilot.hold_modes)
     finding += f"; arming then: {refused or 'SUCCESS'}"
-    require(refused == "COMMAND_DENIED", finding)
+    checklist.require(refused == "COMMAND_DENIED", finding)
     return finding
 
 
@@ -172,11 +178,11 @@ def _arm(vehicle: VehicleConnection) -> str:
     stopwatch, attempts = WallClock(vehicle.speed), 1
     vehicle.may_be_armed = True
     while reason := vehicle.call("action.arm()", vehicle.action.arm):
-        require(stopwatch.time_us() < ARM_S * US_PER_S, f"{reason}, {attempts} times")
+        checklist.require(stopwatch.time_us() < ARM_S * US_PER_S, f"{reason}, {attempts} times")
         attempts += 1
         vehicle.wait(1.0)
     armed = vehicle.wait_for(lambda: vehicle.armed, 3.0)
-    require(armed, "accepted, but the heartbeat says disarmed")
+    checklist.require(armed, "accepted, but the heartbeat says disarmed")
     return "ACCEPTED, armed" + (f" at attempt {attempts}" if attempts > 1 else "")
 
 
@@ -184,7 +190,7 @@ def _first(vehicle: VehicleConnection, name: str) -> Fields:
     """Return the newest message of a name. Raises CheckFailedError on timeout."""
     stopwatch = WallClock()
     while (fields := vehicle.telemetry.latest(name)) is None:
-        require(stopwatch.time_us() < FIRST_MESSAGE_S * US_PER_S, f"no {name}")
+        checklist.require(stopwatch.time_us() < FIRST_MESSAGE_S * US_PER_S, f"no {name}")
         vehicle.poll()
     return fields
 
@@ -199,19 +205,21 @@ def _require_rates(
         if abs(counts[name] - rate_hz * elapsed_s)
         > max(RATE_SHARE * rate_hz * elapsed_s, RATE_MESSAGES)
     ]
-    require(not wrong, finding + "; ".join(wrong))
+    checklist.require(not wrong, finding + "; ".join(wrong))
 
 
 GROUND_CHECKS = (
-    CheckDefinition("version", _version, for_steps=True),
-    CheckDefinition("clock", _clock, for_steps=True),
-    CheckDefinition("streams unasked", _unasked_streams),
-    CheckDefinition("streams asked for", _ask_streams, essential=True, for_steps=True),
-    CheckDefinition("ready to arm", _ready, essential=True, for_steps=True),
-    CheckDefinition("stream rates", _asked_streams, for_steps=True),
-    CheckDefinition("unknown command", _unknown_command),
-    CheckDefinition("unknown mode", _unknown_mode),
-    CheckDefinition("offboard without setpoint, on the ground", _offboard_without_setpoint),
-    CheckDefinition("arm", _arm, essential=True, for_steps=True),
+    checklist.CheckDefinition("version", _version, for_steps=True),
+    checklist.CheckDefinition("clock", _clock, for_steps=True),
+    checklist.CheckDefinition("streams unasked", _unasked_streams),
+    checklist.CheckDefinition("streams asked for", _ask_streams, essential=True, for_steps=True),
+    checklist.CheckDefinition("ready to arm", _ready, essential=True, for_steps=True),
+    checklist.CheckDefinition("stream rates", _asked_streams, for_steps=True),
+    checklist.CheckDefinition("unknown command", _unknown_command),
+    checklist.CheckDefinition("unknown mode", _unknown_mode),
+    checklist.CheckDefinition(
+        "offboard without setpoint, on the ground", _offboard_without_setpoint
+    ),
+    checklist.CheckDefinition("arm", _arm, essential=True, for_steps=True),
 )
 """Ground checks, executed in this order after the heartbeat."""

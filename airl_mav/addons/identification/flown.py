@@ -14,8 +14,7 @@ from airl_mav.addons.recordings.recorded_flight import NAVIGATING, path_of, stam
 from airl_mav.black_box.mcap_file import BlackBox
 from airl_mav.black_box.messages import Decision, Phase
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.unsupported import PAGE
+from airl_mav.core.errors import PAGE, UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import SETPOINT, commanded
 from airl_mav.vehicle_log import MOTORS, ClockAlignment, VehicleLog, align

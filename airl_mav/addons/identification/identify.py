@@ -47,8 +47,7 @@ from airl_mav.flight.statistics import QUANTILE
 from airl_mav.latency.stages import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import ComputerProfile, load_computer
-from airl_mav.profiles.conditions import Payload, loaded
-from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import Payload, VehicleProfile, load_vehicle, loaded
 from airl_mav.vehicle_log import ClockAlignment, read_vehicle_log
 
 LEAST = 5

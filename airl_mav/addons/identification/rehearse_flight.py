@@ -28,7 +28,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec, Size
-from airl_mav.profiles.conditions import WindSettings
+from airl_mav.profiles.vehicle import WindSettings
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.model import Decisions, Scenario
 from airl_mav.scenario.resolve import resolve

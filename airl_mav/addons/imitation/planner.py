@@ -20,8 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Shape
-from airl_mav.arena.ground import TOP
+from airl_mav.arena.geometry import TOP, Shape
 from airl_mav.arena.relief import extreme_within
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError

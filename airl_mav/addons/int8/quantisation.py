@@ -34,8 +34,8 @@ from airl_mav.policy.card import (
 )
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import Encoded, encode_layout
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.scenario.checks import action_generator
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 from airl_mav.scenario.resolve import resolve

@@ -8,14 +8,13 @@ from pathlib import Path
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, arenas_of, flown_path, vehicle_of
 from airl_mav.report.comparison.comparison_model import Comparison
 from airl_mav.report.comparison.show import comparison_to_document
 from airl_mav.report.comparison.tables import runs_table
 from airl_mav.report.document import Headline, TableView, columns_of, environment
 from airl_mav.report.measures import MEASURES, summarize_run
 from airl_mav.report.plotly_scene import SceneFlight, top_speed
-from airl_mav.report.run_arenas import arenas_of, flown_path, vehicle_of
 from airl_mav.report.run_figures import map_figure, overview_picture
 from airl_mav.report.run_report import pictured, run_headlines
 from airl_mav.report.run_verdict import OverallVerdict, load_verdict, verdict_of

@@ -31,7 +31,7 @@ from airl_mav.policy.observation import Observation
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.link_interface import LinkError
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import MissionResult, check_camera, fly_mission
+from companion.pilot import MissionResult, check_camera, fly_mission
 from companion.program import mission_camera, prepare
 from companion.systemd import every
 from companion.watchdog import ThreadGuard

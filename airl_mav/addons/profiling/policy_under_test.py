@@ -26,10 +26,9 @@ from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.actions import flyable
 from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
 from airl_mav.policy.card_writing import write_template
-from airl_mav.policy.learned import LearnedPolicy, open_network
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera, camera_mismatch
-from airl_mav.policy.registry import find_policy
+from airl_mav.policy.registry import LearnedPolicy, find_policy, open_network
 from airl_mav.profiles.computer import Network
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

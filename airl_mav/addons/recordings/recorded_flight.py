@@ -1,11 +1,11 @@
-"""Conversion of a black box to an episode for reports and comparisons."""
+"""Conversion of a black box, and of the vehicle's log, to an episode for reports."""
 
 from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from pydantic import Field, TypeAdapter
 
 from airl_mav.black_box.mcap_file import BlackBox, read_black_box
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
-from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
+from airl_mav.core.constants import UNMEASURED_A, US_PER_MS, US_PER_S, CommandKind
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import sha256_of, typed
 from airl_mav.core.frames import Goal, goal_distance_m
@@ -21,12 +21,15 @@ from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory, measure_quality
-from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS
+from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS, commanded
 from airl_mav.rehearsal import run_folder
 from companion.limits import OUT_OF_TIME
 
+if TYPE_CHECKING:
+    from airl_mav.vehicle_log import ClockAlignment, VehicleLog
+
 NAVIGATING = "navigating"
-"""Phase in which the policy flies (`companion.offboard_mission`)."""
+"""Phase in which the policy flies (`companion.pilot`)."""
 
 LEAST_NORM = 0.5
 """Minimum norm of a valid quaternion."""
@@ -226,7 +229,6 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if ulg is not None:
         # Imported here: pyulog is an extra.
-        from airl_mav.addons.recordings.logged_episode import logged_episode_of
         from airl_mav.vehicle_log import read_vehicle_log
 
         log = read_vehicle_log(ulg)
@@ -240,3 +242,69 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     episode = episode_of(box) if ulg is None else logged_episode_of(box, log)
     run_folder.RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
     return folder
+
+
+def logged_episode_of(box: BlackBox, log: VehicleLog) -> run_folder.FlownEpisode:
+    """Return the flight with path, power and motor outputs from the log, or raise UsageError."""
+    # Imported here: pyulog is an extra.
+    from airl_mav.vehicle_log import align
+
+    told = path_of(box)
+    stamps = stamps_of(box)
+    kind = commanded(stamps)
+    setpoints = np.asarray(stamps[SETPOINTS[kind]], np.float64)
+    clocks = align(told, log, stamps["sent_us"], setpoints, kind)
+    ahead_us = offset_us(clocks)
+    path = _path(told, log, clocks.told_us, ahead_us)
+    note = (
+        f"path, power and motor outputs are those of {log.path.name}; its clock is"
+        f" {-ahead_us / US_PER_MS:+.1f} ms ahead of the recording's, by attitude and velocity in"
+        f" both (which agree to {clocks.error_m_s:.3f} m/s) and {clocks.setpoints} setpoints"
+    )
+    episode = episode_of(box, path, (note,))
+    columns: dict[str, NDArray[Any]] = {
+        **episode.latency,
+        run_folder.MOTOR_TIMES: np.round(log.motors.time_us + ahead_us).astype(np.int64),
+        run_folder.MOTOR_OUTPUTS: log.motors.values.astype(np.float32),
+    }
+    return run_folder.FlownEpisode(episode.record, path, columns)
+
+
+def offset_us(clocks: ClockAlignment) -> float:
+    """Return the offset from log to companion time [µs].
+
+    Assumes equal delays both ways if both are known, as NTP does (D. Mills, RFC 5905).
+    """
+    if clocks.accepted_us is None:
+        return clocks.told_us
+    return 0.5 * (clocks.told_us - clocks.accepted_us)
+
+
+def _path(told: Trajectory, log: VehicleLog, told_us: float, ahead_us: float) -> Trajectory:
+    """Return the log's estimate at its attitude times, with the battery's power."""
+    attitude, motion = log.attitude, log.motion
+    inside = (attitude.time_us >= motion.time_us[0]) & (attitude.time_us <= motion.time_us[-1])
+    logged_us, quaternion = attitude.time_us[inside], attitude.values[inside]
+    state = motion.at(logged_us)
+    # Both usually share the estimator's origin; otherwise, the goal uses the recording's origin.
+    both = (told.time_us - told_us >= motion.time_us[0]) & (
+        told.time_us - told_us <= motion.time_us[-1]
+    )
+    apart = told.position[both] - motion.at(told.time_us[both] - told_us)[:, :3]
+    position = state[:, :3] + np.median(apart, axis=0)
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    times_us = np.round(logged_us + ahead_us).astype(np.int64)
+    power_w = _logged_power_w(log, logged_us, told, times_us)
+    return Trajectory(times_us, position, state[:, 3:], quaternion / length, power_w)
+
+
+def _logged_power_w(
+    log: VehicleLog, logged_us: NDArray[np.int64], told: Trajectory, times_us: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the battery's power (n,) from the log, or from the recording without log values."""
+    battery = log.battery
+    known = np.isfinite(battery.values[:, :2]).all(axis=1) if len(battery) else np.zeros(0, bool)
+    if not known.any():
+        return np.interp(times_us, told.time_us, told.power_w)
+    watts = battery.values[known, 0] * battery.values[known, 1]
+    return np.asarray(np.interp(logged_us, battery.time_us[known], watts), np.float64)

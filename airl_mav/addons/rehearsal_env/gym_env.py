@@ -35,7 +35,7 @@ from airl_mav.policy.actions import Action, AnyAction, BodyRates, command, comma
 from airl_mav.policy.layouts import Encoded, encode_layout, newest_frame
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.registry import PolicyInfo
-from airl_mav.profiles.conditions import SensorNoise, Spread
+from airl_mav.profiles.vehicle import SensorNoise, Spread
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario, WatchdogSettings
 from airl_mav.scenario.resolve import ResolvedScenario, resolve

@@ -12,12 +12,12 @@ from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.turns import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.checks import NATIVE_T2_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.conducted import ConductedClock
 from companion.frame_source import open_camera
 from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
-from companion.offboard_mission import MissionResult, check_camera, fly_mission
+from companion.pilot import MissionResult, check_camera, fly_mission
 from companion.program import MissionSetup
+from companion.watchdog import ConductedClock
 
 ANSWER_TIMEOUT_S = 20.0
 """Timeout after which MAVSDK repeats a command, at most four times [wall s]. Long enough for all

@@ -15,8 +15,8 @@ from typing import Literal, Protocol, cast
 
 from airl_mav.core.clock import Clock, SimClock
 from airl_mav.core.constants import US_PER_S
-from companion.conducted import Abandoned, Poll
 from companion.frame_source import FrameSource, ReceivedFrame
+from companion.watchdog import Abandoned, Poll
 
 Order = Literal["", "land", "abandon", "end"]
 """Order to the companion: no order; stop and land; abandon the flight without landing; the

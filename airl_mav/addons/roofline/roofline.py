@@ -30,11 +30,9 @@ from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.experiments.hardware_gap import DEFAULT_WORKLOAD
 from airl_mav.latency.injection import ESTIMATE, Injection, choose_injection
 from airl_mav.policy.card import vehicle_mismatch
-from airl_mav.policy.learned import load_learned
-from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.policy.registry import PolicyInfo, find_policy, load_learned
 from airl_mav.profiles.computer import ComputerProfile, load_computer
-from airl_mav.profiles.conditions import Payload, loaded
-from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import Payload, VehicleProfile, load_vehicle, loaded
 from airl_mav.report.document import Document, print_document, print_place, write_document
 from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName

@@ -15,7 +15,7 @@ from airl_mav.addons.sweep.config import (
 from airl_mav.addons.sweep.summary import SweepFolder
 from airl_mav.envs.evaluation import SLOTS, EpisodeResult, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
-from airl_mav.policy.learned import load_learned
+from airl_mav.policy.registry import load_learned
 from airl_mav.rehearsal.run_folder import locked
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.training_folder import TrainingFolder, TrainingProgress

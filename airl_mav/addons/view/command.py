@@ -17,8 +17,7 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import new_console
-from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.run_arenas import trust_arenas
+from airl_mav.rehearsal.run_folder import load, trust_arenas
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 

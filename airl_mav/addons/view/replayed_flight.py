@@ -21,8 +21,7 @@ from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord, ranked
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import SETPOINT, commanded, setpoint_column
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, RUN_FILE, LoadedRun, load
-from airl_mav.report.run_arenas import arenas_of, spec_of, vehicle_of
+from airl_mav.rehearsal import run_folder
 
 INFO, WARNING = 6, 4
 """Levels of MAV_SEVERITY."""
@@ -214,9 +213,9 @@ def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:
 
 def run_folders(path: Path) -> list[Path]:
     """Return a campaign's run folders, or the path itself; raise UsageError if it is empty."""
-    if not (path / CAMPAIGN_FILE).is_file():
+    if not (path / run_folder.CAMPAIGN_FILE).is_file():
         return [path]
-    found = sorted(file.parent for file in path.glob(f"*/{RUN_FILE}"))
+    found = sorted(file.parent for file in path.glob(f"*/{run_folder.RUN_FILE}"))
     if not found:
         raise UsageError(f"{path}: a campaign of which no run has begun")
     return found
@@ -258,8 +257,8 @@ class ReplayedRun:
 
     def __init__(self, path: Path) -> None:
         """Read a run folder; raise UsageError without recorded flights or with missing profiles."""
-        self._run: LoadedRun = load(path)
-        self._vehicle: VehicleProfile = vehicle_of(self._run.info)
+        self._run: run_folder.LoadedRun = run_folder.load(path)
+        self._vehicle: VehicleProfile = run_folder.vehicle_of(self._run.info)
         self.path, self.info = path, self._run.info
         self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
         """Title of the run: policy and arena."""
@@ -284,7 +283,7 @@ class ReplayedRun:
     def check(self, record: EpisodeRecord) -> None:
         """Raise UsageError if the arena of a flight cannot be generated."""
         if record.arena != NO_ARENA:
-            spec_of(record.arena)
+            run_folder.spec_of(record.arena)
 
     def way(self, record: EpisodeRecord) -> ReplayedFlight:
         """Return a flight without its arena, which is slow to generate."""
@@ -302,7 +301,7 @@ class ReplayedRun:
         """Return a flight with its arena. Raises UsageError if the arena cannot be generated."""
         index = record.index
         if index not in self._made:
-            arena = arenas_of([record], self._vehicle).get(index)
+            arena = run_folder.arenas_of([record], self._vehicle).get(index)
             self._made[index] = replace(self.way(record), arena=arena)
         return self._made[index]
 

@@ -15,14 +15,13 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Estimate
 from airl_mav.latency.stages import ALL_STAGES, Samples
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, arena_of
 from airl_mav.report import theme
 from airl_mav.report.comparison.build import samples_of, tests_of
 from airl_mav.report.comparison.comparison_model import ComparedRun, Comparison, Contrast
 from airl_mav.report.comparison.tables import contrast_head, published_change
 from airl_mav.report.document import NONE, OUTCOME_LABELS
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
-from airl_mav.report.run_arenas import arena_of
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS, RunFlights, path_points
 
 ROW_IN = 0.5

@@ -16,7 +16,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_from_euler
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.inputs import LandingTarget, ObstacleBins
+from firmware_sim.autopilot.modes.interface import LandingTarget, ObstacleBins
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import Context, Handlers, for_anyone

@@ -19,8 +19,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, Q
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ObstacleBins
-from firmware_sim.autopilot.modes.interface import FlightContext
+from firmware_sim.autopilot.modes.interface import FlightContext, ObstacleBins
 from firmware_sim.autopilot.modes.sticks import Pair, Position
 from firmware_sim.autopilot.smooth_trajectory import braking_speed
 

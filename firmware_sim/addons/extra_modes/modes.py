@@ -22,9 +22,8 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, OrbitStatus, Se
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import LandingTarget, ModeRequest, OrbitRequest, PrecisionRequest
+from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.modes.automatic import Hold, landing_speed
-from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, since
 from firmware_sim.autopilot.modes.sticks import IDLE_THROTTLE, RELEASED, superexpo
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
@@ -48,10 +47,10 @@ class Facing(IntEnum):
     UNCHANGED = 5
 
 
-class Orbit(FlightMode, modes=(Mode.ORBIT,)):
+class Orbit(interface.FlightMode, modes=(Mode.ORBIT,)):
     """Orbit mode: flies to the circle, then along it."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._centre: Vec = (0.0, 0.0, 0.0)
         self._radius = LEAST_RADIUS_M
@@ -65,7 +64,7 @@ class Orbit(FlightMode, modes=(Mode.ORBIT,)):
         """Current speed, which rises with MPC_ACC_HOR [m/s]."""
         self._time_us: int | None = None
 
-    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, request: interface.ModeRequest | None, /) -> None:
         """Start, or change the active orbit."""
         if self._context.orbit is None:  # otherwise the active orbit is changed
             self._centre, self._radius, self._speed = triple(state, P), LEAST_RADIUS_M, 1.0
@@ -73,12 +72,12 @@ class Orbit(FlightMode, modes=(Mode.ORBIT,)):
         self._initial_yaw = self._yaw = quat_yaw(state[Q:RATES])
         self._going_round, self._present = False, 0.0
         self._facing = Facing(int(self._context.value("MC_ORBIT_YAW_MOD")))
-        if isinstance(request, OrbitRequest):
+        if isinstance(request, interface.OrbitRequest):
             self._apply(request)
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Fly straight to the circle first, then along it."""
-        dt, self._time_us = since(self._time_us, time_us), time_us
+        dt, self._time_us = interface.since(self._time_us, time_us), time_us
         position = triple(state, P)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]
         distance = math.hypot(north, east)
@@ -106,12 +105,14 @@ class Orbit(FlightMode, modes=(Mode.ORBIT,)):
         velocity = (
             -outward[1] * self._present + outward[0] * correction,
             outward[0] * self._present + outward[1] * correction,
-            NAN,
+            interface.NAN,
         )
         inward = self._present * self._present / self._radius
-        acceleration = (-outward[0] * inward, -outward[1] * inward, NAN)
+        acceleration = (-outward[0] * inward, -outward[1] * inward, interface.NAN)
         yaw, rate = self._heading(outward, now, dt)
-        return TrajectoryDemand((NAN, NAN, self._centre[2]), velocity, acceleration, yaw, rate)
+        return TrajectoryDemand(
+            (interface.NAN, interface.NAN, self._centre[2]), velocity, acceleration, yaw, rate
+        )
 
     def _heading(self, outward: tuple[float, float], now: float, dt: float) -> tuple[float, float]:
         """Return heading [rad] and yaw rate [rad/s]; MPC_YAWRAUTO_MAX limits the rate."""
@@ -119,20 +120,20 @@ class Orbit(FlightMode, modes=(Mode.ORBIT,)):
         side = math.copysign(1.0, self._speed)
         if self._facing is Facing.UNCONTROLLED:
             self._yaw = now
-            return NAN, NAN
+            return interface.NAN, interface.NAN
         if self._facing is Facing.INITIAL_HEADING:
-            target, rate = self._initial_yaw, NAN
+            target, rate = self._initial_yaw, interface.NAN
         elif self._facing is Facing.TANGENT:
             target = math.atan2(side * outward[0], -side * outward[1])
         elif self._facing is Facing.PILOT:
-            target, rate = self._yaw, NAN
+            target, rate = self._yaw, interface.NAN
         else:
             target = math.atan2(-outward[1], -outward[0])
         most = self._context.value("MPC_YAWRAUTO_MAX") * DEG * dt
         self._yaw = wrap_pi(self._yaw + min(most, max(-most, wrap_pi(target - self._yaw))))
         return self._yaw, rate
 
-    def _apply(self, request: OrbitRequest) -> None:
+    def _apply(self, request: interface.OrbitRequest) -> None:
         """Apply a request; NaN keeps the current value."""
         radius, clockwise = self._radius, self._speed > 0.0
         if not math.isnan(request.radius_m):
@@ -164,17 +165,17 @@ WALKS_M_S = 1.0
 """Minimum speed at which a target has a course; below it, the last course applies [m/s]."""
 
 
-class Follow(FlightMode, modes=(Mode.FOLLOW,)):
+class Follow(interface.FlightMode, modes=(Mode.FOLLOW,)):
     """Follow mode: keeps a position relative to the target's course, nose towards the target."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._waiting = Hold(context)
         self._course = 0.0
         """Course of the target [rad]."""
         self._following = False
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start; until the target moves, its course is the vehicle's heading."""
         self._course, self._following = quat_yaw(state[Q:RATES]), False
         self._waiting.enter(state, None)
@@ -207,10 +208,10 @@ class Follow(FlightMode, modes=(Mode.FOLLOW,)):
         return travel.fly(state, time_us, PathSegment(place, velocity=(vn, ve, 0.0)), yaw=yaw)
 
 
-class Acro(FlightMode, modes=(Mode.ACRO,)):
+class Acro(interface.FlightMode, modes=(Mode.ACRO,)):
     """Body rates proportional to the sticks, and thrust linear in the throttle stick."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
 
     @property
@@ -264,10 +265,10 @@ class _State(Enum):
 _DOWNWARDS = (_State.DESCEND, _State.FINAL, _State.FALLBACK)
 
 
-class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
+class PrecisionLand(interface.FlightMode, modes=(Mode.PRECISION_LAND,)):
     """Precision landing mode: finds the target and lands on it; without one, lands in place."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._state = _State.START
         self._goal: Vec = (0.0, 0.0, 0.0)
@@ -289,10 +290,10 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
         north, east, down = self._goal
         return north, east, self._context.home[2] if self._state in _DOWNWARDS else down
 
-    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, request: interface.ModeRequest | None, /) -> None:
         """Start above the request's place, by default here, and search for the target."""
-        if not isinstance(request, PrecisionRequest):
-            request = PrecisionRequest(triple(state, P), required=True)
+        if not isinstance(request, interface.PrecisionRequest):
+            request = interface.PrecisionRequest(triple(state, P), required=True)
         self._goal, self._required = request.place, request.required
         self._searches, self._next_us = 1, 0
         self._report_us, self._is_new = -1, False
@@ -417,7 +418,7 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
     # --- the target
 
     @property
-    def _target(self) -> LandingTarget | None:
+    def _target(self) -> interface.LandingTarget | None:
         return self._context.landing_target
 
     def _is_visible(self, now_us: int) -> bool:
@@ -427,13 +428,13 @@ class PrecisionLand(FlightMode, modes=(Mode.PRECISION_LAND,)):
             return False
         return now_us - target.time_us <= self._context.value("PLD_BTOUT") * US_PER_S
 
-    def _is_over(self, target: LandingTarget, position: Vec) -> bool:
+    def _is_over(self, target: interface.LandingTarget, position: Vec) -> bool:
         """Return whether the vehicle is above the target, within PLD_HACC_RAD on each axis."""
         radius = self._context.value("PLD_HACC_RAD")
         offsets = (a - b for a, b in zip(target.position[:2], position[:2], strict=True))
         return all(abs(offset) < radius for offset in offsets)
 
-    def _is_near_ground(self, target: LandingTarget, position: Vec, now_us: int) -> bool:
+    def _is_near_ground(self, target: interface.LandingTarget, position: Vec, now_us: int) -> bool:
         """Return whether the vehicle is within PLD_FAPPR_ALT above a visible target."""
         above = target.position[2] - position[2]
         return self._is_visible(now_us) and above < self._context.value("PLD_FAPPR_ALT")

@@ -22,8 +22,7 @@ from airl_mav.camera.render import Motion
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.faults import MOTORS, NOISE_SEED, SENSORS, Fault, gust_share
-from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import Battery, Sensors, VehicleProfile
+from airl_mav.profiles.vehicle import Battery, SensorNoise, Sensors, VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
 from firmware_sim import interfaces
 from firmware_sim.engine.dynamics import Speeds

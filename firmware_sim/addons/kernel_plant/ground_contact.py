@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.ground import COLUMNS, ROWS, TOP, Relief
+from airl_mav.arena.geometry import COLUMNS, ROWS, TOP, Relief
 from airl_mav.arena.relief import extreme_within, plane_at
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel

@@ -32,9 +32,8 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.events.definition import define
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ModeRequest, PrecisionRequest
+from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, optional_mode
 from firmware_sim.autopilot.modes.return_to_launch import return_height
 from firmware_sim.autopilot.navigation import plan
 from firmware_sim.autopilot.navigation.geofence import FenceMonitor
@@ -353,13 +352,13 @@ _MOVES_M_S = 0.5
 """Minimum speed to turn the nose along the path [m/s] (MPC_YAW_MODE = 3)."""
 
 
-class MissionMode(FlightMode, modes=(Mode.MISSION,)):
+class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
     """Mission mode: follows the triplets of missions with PX4's speeds at and between waypoints."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._triplet: Triplet | None = None
-        self._precision = optional_mode(Mode.PRECISION_LAND, context)
+        self._precision = interface.optional_mode(Mode.PRECISION_LAND, context)
         self._lands_precisely = False
 
     @property
@@ -377,7 +376,7 @@ class MissionMode(FlightMode, modes=(Mode.MISSION,)):
         """Position of the active item."""
         return self._path.target
 
-    def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, _state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start; the executor supplies the waypoints."""
         self._triplet, self._lands_precisely = None, False
 
@@ -400,7 +399,9 @@ class MissionMode(FlightMode, modes=(Mode.MISSION,)):
                 self._lands_precisely = True
                 north, east, down = *triplet.target[:2], position[2]
                 required = triplet.precision == _REQUIRED
-                self._precision.enter(state, PrecisionRequest((north, east, down), required))
+                self._precision.enter(
+                    state, interface.PrecisionRequest((north, east, down), required)
+                )
             return self._precision.demand(state, time_us)
         self._lands_precisely = False
         yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)

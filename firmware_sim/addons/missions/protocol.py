@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.addons.missions import wire_items
+from firmware_sim.addons.missions import items
 from firmware_sim.addons.missions.items import MOST_ITEMS
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
@@ -269,7 +269,7 @@ def _begin_upload(message: WireMessage, context: services.Context) -> bool:
 def handle_item(message: WireMessage, context: services.Context) -> bool:
     """Handle MISSION_ITEM(_INT): store an item and request the next."""
     transfer, partner = context.state(MissionTransfer), services.sender(message)
-    transfer.integer = wire_items.is_int(message)
+    transfer.integer = items.is_int(message)
     if partner != transfer.partner:
         _report(context, "REJ. MIS ITEM: partner id mismatch", ITEM_OF_ANOTHER)
         return True
@@ -298,15 +298,15 @@ def handle_item(message: WireMessage, context: services.Context) -> bool:
 
 def _take_item(message: WireMessage, context: services.Context) -> bool:
     transfer = context.state(MissionTransfer)
-    item, kind = wire_items.parse(message), MissionType(transfer.kind)
+    item, kind = items.parse(message), MissionType(transfer.kind)
     if isinstance(item, int):
         _report(context, "IGN MISSION_ITEM: Invalid item", ITEM_INVALID)
         _acknowledge(context, transfer.partner, item)
         _end_upload(context)
         return True
     # The checksum also covers an item that is rejected below.
-    transfer.checksum = wire_items.checksum(message, transfer.checksum)
-    if not wire_items.belongs(item, kind):
+    transfer.checksum = items.checksum(message, transfer.checksum)
+    if not items.belongs(item, kind):
         _acknowledge(context, transfer.partner, _ERROR)
         _end_upload(context)
         return True
@@ -435,7 +435,7 @@ def _send_item(context: services.Context, index: int) -> None:
     plans = context.port.plans
     transfer.sent_us = context.now_us
     context.link.send(
-        wire_items.format_item(
+        items.format_item(
             plans.stored(kind).items[index],
             kind,
             index,

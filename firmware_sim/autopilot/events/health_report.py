@@ -11,13 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.events.definition import (
-    Component,
-    Definition,
-    Level,
-    MavlinkEvent,
-    arguments,
-)
+from firmware_sim.autopilot.events import definition
 from firmware_sim.autopilot.failsafes.failsafe_conditions import lacking
 from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.prearm import CHECKS, SUPPLY_CHECK_OFF, PrearmCheck, Readiness
@@ -34,8 +28,17 @@ MAX_CHECKS = 14
 """Maximum number of checks in a report, as in PX4."""
 
 
-def _summary(name: str, message: str, group: str, listed: str) -> Definition:
-    return Definition(name, message, arguments(listed), Level.PROTOCOL, None, "", group, "summary")
+def _summary(name: str, message: str, group: str, listed: str) -> definition.Definition:
+    return definition.Definition(
+        name,
+        message,
+        definition.arguments(listed),
+        definition.Level.PROTOCOL,
+        None,
+        "",
+        group,
+        "summary",
+    )
 
 
 ARMING_SUMMARY = _summary(
@@ -61,7 +64,7 @@ class HealthReport(NamedTuple):
     """Bits of the modes that permit arming."""
     can_run: int
     """Bits of the modes available in flight."""
-    checks: tuple[MavlinkEvent, ...]
+    checks: tuple[definition.MavlinkEvent, ...]
     """Events of the failing checks."""
     arming_error: int = 0
     """Bits of `Component`, like the four fields below."""
@@ -70,7 +73,7 @@ class HealthReport(NamedTuple):
     health_error: int = 0
     health_warning: int = 0
 
-    def events(self) -> tuple[MavlinkEvent, ...]:
+    def events(self) -> tuple[definition.MavlinkEvent, ...]:
         """Return the events of the report in order."""
         whole = 0
         return (
@@ -86,7 +89,7 @@ class HealthReport(NamedTuple):
 def health_report(readiness: Readiness) -> HealthReport:
     """Return the findings of the checks for all modes."""
     in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}
-    findings: list[MavlinkEvent] = []
+    findings: list[definition.MavlinkEvent] = []
     blocked = arming_error = arming_warning = health_error = health_warning = 0
     for check in CHECKS:
         modes = _blocked_modes(check, readiness, in_modes)
@@ -95,7 +98,7 @@ def health_report(readiness: Readiness) -> HealthReport:
         blocked |= modes
         bit = check.component.value
         level = check.event.level if check.level is None else check.level(readiness)
-        error, warning = level <= Level.ERROR, level is Level.WARNING
+        error, warning = level <= definition.Level.ERROR, level is definition.Level.WARNING
         if check.is_health:
             health_error |= bit * error
             health_warning |= bit * warning
@@ -153,14 +156,14 @@ def _bits(modes: Iterable[Mode]) -> int:
 def _present(r: Readiness) -> int:
     """Return the components that are present, healthy or not."""
     there = {
-        Component.GYRO: True,  # PX4 reports it for the accelerometer, too
-        Component.ABSOLUTE_PRESSURE: bool(r.settings.sys_has_baro),
-        Component.MAGNETOMETER: bool(r.settings.sys_has_mag),
-        Component.GPS: bool(r.settings.sys_has_gps) and r.gps,
-        Component.BATTERY: r.settings.cbrk_supply_chk != SUPPLY_CHECK_OFF,
-        Component.REMOTE_CONTROL: not r.conditions.manual_control_signal_lost,
-        Component.COMMUNICATION_LINKS: not r.conditions.gcs_connection_lost,
-        Component.LOCAL_POSITION_ESTIMATE: True,
+        definition.Component.GYRO: True,  # PX4 reports it for the accelerometer, too
+        definition.Component.ABSOLUTE_PRESSURE: bool(r.settings.sys_has_baro),
+        definition.Component.MAGNETOMETER: bool(r.settings.sys_has_mag),
+        definition.Component.GPS: bool(r.settings.sys_has_gps) and r.gps,
+        definition.Component.BATTERY: r.settings.cbrk_supply_chk != SUPPLY_CHECK_OFF,
+        definition.Component.REMOTE_CONTROL: not r.conditions.manual_control_signal_lost,
+        definition.Component.COMMUNICATION_LINKS: not r.conditions.gcs_connection_lost,
+        definition.Component.LOCAL_POSITION_ESTIMATE: True,
     }
     return sum(part.value for part, here in there.items() if here)
 
@@ -168,7 +171,7 @@ def _present(r: Readiness) -> int:
 class HealthReporter:
     """Sender of health reports, on change and on demand."""
 
-    def __init__(self, send: Callable[[MavlinkEvent], None]) -> None:
+    def __init__(self, send: Callable[[definition.MavlinkEvent], None]) -> None:
         """Store the callback that sends an event."""
         self._send = send
         self._readiness: Readiness | None = None

@@ -14,16 +14,7 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
-from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    FLIGHT_TERMINATION_OFF,
-    BatteryWarning,
-    Clear,
-    Conditions,
-    FailsafeSettings,
-    Options,
-    Takeover,
-    can_run,
-)
+from firmware_sim.autopilot.failsafes import failsafe_conditions
 from firmware_sim.autopilot.flight_modes import Mode, Need
 
 MODE_OF_ACTION = {
@@ -57,19 +48,22 @@ def mode_of(action: FailsafeAction, intended: Mode) -> Mode:
     return MODE_OF_ACTION.get(action, intended)
 
 
-def possible(action: FailsafeAction, conditions: Conditions) -> FailsafeAction:
+def possible(action: FailsafeAction, conditions: failsafe_conditions.Conditions) -> FailsafeAction:
     """Return the action, or the next possible one in the chain, which ends at Terminate."""
     if action not in MODE_OF_ACTION:
         return action
     # Actions in ascending order: from the requested one to Terminate.
     chain = (a for a in MODE_OF_ACTION if a >= action)
     return next(
-        (a for a in chain if can_run(MODE_OF_ACTION[a], conditions)), FailsafeAction.TERMINATE
+        (a for a in chain if failsafe_conditions.can_run(MODE_OF_ACTION[a], conditions)),
+        FailsafeAction.TERMINATE,
     )
 
 
 def mode_fallback(
-    conditions: Conditions, settings: FailsafeSettings, intended: Mode
+    conditions: failsafe_conditions.Conditions,
+    settings: failsafe_conditions.FailsafeSettings,
+    intended: Mode,
 ) -> FailsafeAction:
     """Return the replacement of an intended mode that cannot run; NONE = it can."""
     action, mode = FailsafeAction.NONE, intended
@@ -81,27 +75,31 @@ def mode_fallback(
         # From here on, the requirements of the action's mode apply.
         mode = MODE_OF_ACTION[action]
     if settings.com_posctl_navl == 0:
-        if mode is Mode.POSITION and not can_run(mode, conditions):
+        if mode is Mode.POSITION and not failsafe_conditions.can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
         # The replacement itself may be impossible: continue to the next one.
-        if mode is Mode.ALTITUDE and not can_run(mode, conditions):
+        if mode is Mode.ALTITUDE and not failsafe_conditions.can_run(mode, conditions):
             action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
-    elif settings.com_posctl_navl == 1 and mode is Mode.POSITION and not can_run(mode, conditions):
+    elif (
+        settings.com_posctl_navl == 1
+        and mode is Mode.POSITION
+        and not failsafe_conditions.can_run(mode, conditions)
+    ):
         action, mode = FailsafeAction.LAND, Mode.LAND
-        if not can_run(mode, conditions):
+        if not failsafe_conditions.can_run(mode, conditions):
             action, mode = FailsafeAction.DESCEND, Mode.DESCEND
-    return action if can_run(mode, conditions) else FailsafeAction.RTL
+    return action if failsafe_conditions.can_run(mode, conditions) else FailsafeAction.RTL
 
 
-NOTHING = Options(FailsafeAction.NONE)
+NOTHING = failsafe_conditions.Options(FailsafeAction.NONE)
 
 
 class Situation(NamedTuple):
     """Current state of the vehicle: input of the failsafes."""
 
     time_us: int
-    conditions: Conditions
-    settings: FailsafeSettings
+    conditions: failsafe_conditions.Conditions
+    settings: failsafe_conditions.FailsafeSettings
     intended: Mode
     """Mode requested by the user."""
     mission_finished: bool = False
@@ -109,7 +107,7 @@ class Situation(NamedTuple):
     """Time of arming; None = disarmed."""
     manual_control_lost_at_arming: bool = False
     """Manual control was lost at arming and has not returned: it is optional."""
-    battery_at_arming: BatteryWarning = BatteryWarning.NONE
+    battery_at_arming: failsafe_conditions.BatteryWarning = failsafe_conditions.BatteryWarning.NONE
     armed: bool = False
 
 
@@ -140,17 +138,17 @@ class Row:
     when: str
     """Condition, for the manual."""
     occurs: Callable[[Situation], bool]
-    answers: Mapping[int, Options]
+    answers: Mapping[int, failsafe_conditions.Options]
     """Responses by parameter value; a row without a parameter has key 0 only."""
     parameter: str | None = None
-    otherwise: Options = NOTHING
+    otherwise: failsafe_conditions.Options = NOTHING
     """Response to an undefined parameter value."""
     related: tuple[str, ...] = ()
     """Other parameters of the condition."""
     value: Callable[[Situation], int] | None = None
     """Key into `answers` if it differs from the parameter's value."""
 
-    def options(self, situation: Situation) -> Options:
+    def options(self, situation: Situation) -> failsafe_conditions.Options:
         """Return the response if the failsafe is triggered in a situation."""
         if self.value is not None:
             chosen = self.value(situation)
@@ -166,15 +164,27 @@ _STICKS_OFF = 4
 _EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
 """Bits of COM_RCL_EXCEPT."""
 
-_NONE, _WARN, _HOLD = NOTHING, Options(FailsafeAction.WARN), Options(FailsafeAction.HOLD)
-_RETURN = Options(FailsafeAction.RTL, Clear.ON_MODE_CHANGE)
-_LAND = Options(FailsafeAction.LAND, Clear.ON_MODE_CHANGE)
-_LASTING_HOLD = Options(FailsafeAction.HOLD, Clear.ON_MODE_CHANGE)
-_TERMINATE = Options(FailsafeAction.TERMINATE, Clear.NEVER, Takeover.NEVER)
-_DISARM = Options(FailsafeAction.DISARM, takeover=Takeover.NEVER)
+_NONE, _WARN, _HOLD = (
+    NOTHING,
+    failsafe_conditions.Options(FailsafeAction.WARN),
+    failsafe_conditions.Options(FailsafeAction.HOLD),
+)
+_RETURN = failsafe_conditions.Options(FailsafeAction.RTL, failsafe_conditions.Clear.ON_MODE_CHANGE)
+_LAND = failsafe_conditions.Options(FailsafeAction.LAND, failsafe_conditions.Clear.ON_MODE_CHANGE)
+_LASTING_HOLD = failsafe_conditions.Options(
+    FailsafeAction.HOLD, failsafe_conditions.Clear.ON_MODE_CHANGE
+)
+_TERMINATE = failsafe_conditions.Options(
+    FailsafeAction.TERMINATE, failsafe_conditions.Clear.NEVER, failsafe_conditions.Takeover.NEVER
+)
+_DISARM = failsafe_conditions.Options(
+    FailsafeAction.DISARM, takeover=failsafe_conditions.Takeover.NEVER
+)
 
 
-def _caused(answers: Mapping[int, Options], cause: FailsafeCause) -> dict[int, Options]:
+def _caused(
+    answers: Mapping[int, failsafe_conditions.Options], cause: FailsafeCause
+) -> dict[int, failsafe_conditions.Options]:
     return {value: options._replace(cause=cause) for value, options in answers.items()}
 
 
@@ -182,12 +192,12 @@ _LANDING = (Mode.LAND, Mode.PRECISION_LAND)
 _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
 """Responses of NAV_RCL_ACT and NAV_DLL_ACT."""
 
-_ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
+_ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=failsafe_conditions.Takeover.MODE_SWITCH)
 _LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
 """Responses of GF_ACTION."""
 
 _POSITION_LOW = {
-    value: Options(action, takeover=Takeover.MODE_SWITCH)
+    value: failsafe_conditions.Options(action, takeover=failsafe_conditions.Takeover.MODE_SWITCH)
     for value, action in enumerate(
         (
             FailsafeAction.NONE,
@@ -205,7 +215,7 @@ _ACTUATOR = {
     1: _HOLD,
     2: _LAND,
     3: _RETURN,
-    4: Options(FailsafeAction.TERMINATE, Clear.NEVER),
+    4: failsafe_conditions.Options(FailsafeAction.TERMINATE, failsafe_conditions.Clear.NEVER),
 }
 
 
@@ -247,7 +257,7 @@ def _taking_off(s: Situation) -> bool:
 
 
 def _terminates(s: Situation) -> bool:
-    return s.settings.cbrk_flightterm != FLIGHT_TERMINATION_OFF
+    return s.settings.cbrk_flightterm != failsafe_conditions.FLIGHT_TERMINATION_OFF
 
 
 def _battery_action(s: Situation) -> int:
@@ -259,7 +269,7 @@ def _battery_action(s: Situation) -> int:
 
 def _battery_row(
     trigger: Trigger,
-    level: BatteryWarning,
+    level: failsafe_conditions.BatteryWarning,
     title: str,
     cause: FailsafeCause,
     actions: tuple[FailsafeAction, ...],
@@ -270,9 +280,12 @@ def _battery_row(
         title,
         "the charge is below its limit, and was not at arming",
         lambda s: s.conditions.battery_warning is level,
-        {value: Options(action, cause=cause) for value, action in enumerate(actions)},
+        {
+            value: failsafe_conditions.Options(action, cause=cause)
+            for value, action in enumerate(actions)
+        },
         "COM_LOW_BAT_ACT",
-        Options(FailsafeAction.WARN, cause=cause),
+        failsafe_conditions.Options(FailsafeAction.WARN, cause=cause),
         related=(threshold,),
         value=_battery_action,
     )
@@ -304,7 +317,7 @@ TABLE: tuple[Row, ...] = (
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
         _links_lost_after_mission,
-        {0: Options(FailsafeAction.RTL)},
+        {0: failsafe_conditions.Options(FailsafeAction.RTL)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
     ),
     Row(
@@ -312,7 +325,7 @@ TABLE: tuple[Row, ...] = (
         "Flight time over",
         "so long since take-off",
         lambda s: s.conditions.flight_time_limit_exceeded,
-        {0: Options(FailsafeAction.RTL)},
+        {0: failsafe_conditions.Options(FailsafeAction.RTL)},
         related=("COM_FLT_TIME_MAX",),
     ),
     Row(
@@ -324,7 +337,9 @@ TABLE: tuple[Row, ...] = (
         ),
         _POSITION_LOW,
         "COM_POS_LOW_ACT",
-        Options(FailsafeAction.WARN, takeover=Takeover.MODE_SWITCH),
+        failsafe_conditions.Options(
+            FailsafeAction.WARN, takeover=failsafe_conditions.Takeover.MODE_SWITCH
+        ),
         related=("COM_POS_LOW_EPH",),
     ),
     Row(
@@ -334,7 +349,7 @@ TABLE: tuple[Row, ...] = (
         lambda s: any(s.conditions.geofence),
         _LIMITS,
         "GF_ACTION",
-        Options(FailsafeAction.WARN),
+        failsafe_conditions.Options(FailsafeAction.WARN),
         related=("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
     ),
     Row(
@@ -348,21 +363,21 @@ TABLE: tuple[Row, ...] = (
     ),
     _battery_row(
         Trigger.BATTERY_LOW,
-        BatteryWarning.LOW,
+        failsafe_conditions.BatteryWarning.LOW,
         "Battery low",
         FailsafeCause.LOW_BATTERY_LEVEL,
         (_W, _W, _W, _W),
     ),
     _battery_row(
         Trigger.BATTERY_CRITICAL,
-        BatteryWarning.CRITICAL,
+        failsafe_conditions.BatteryWarning.CRITICAL,
         "Battery critical",
         FailsafeCause.CRITICAL_BATTERY_LEVEL,
         (_W, _R, _L, _R),
     ),
     _battery_row(
         Trigger.BATTERY_EMERGENCY,
-        BatteryWarning.EMERGENCY,
+        failsafe_conditions.BatteryWarning.EMERGENCY,
         "Battery empty",
         FailsafeCause.EMERGENCY_BATTERY_LEVEL,
         (_W, _R, _L, _L),
@@ -372,7 +387,7 @@ TABLE: tuple[Row, ...] = (
         "Attitude failure at take-off",
         "roll or pitch out of limits, within COM_SPOOLUP_TIME + COM_LKDOWN_TKO of arming",
         lambda s: s.conditions.fd_critical_failure and _taking_off(s),
-        {0: Options(FailsafeAction.DISARM)},
+        {0: failsafe_conditions.Options(FailsafeAction.DISARM)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "COM_LKDOWN_TKO"),
     ),
     Row(
@@ -380,7 +395,7 @@ TABLE: tuple[Row, ...] = (
         "Attitude failure in flight, CBRK_FLIGHTTERM 0",
         "roll or pitch out of limits",
         lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and _terminates(s),
-        {0: Options(FailsafeAction.TERMINATE)},
+        {0: failsafe_conditions.Options(FailsafeAction.TERMINATE)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
     ),
     Row(
@@ -405,7 +420,7 @@ TABLE: tuple[Row, ...] = (
 """All failsafes except the last, added by `answers`: the fallback of a mode that cannot run."""
 
 
-def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
+def answers(situation: Situation) -> list[tuple[Trigger, failsafe_conditions.Options]]:
     """Return the triggered failsafes with their responses in table order, without NONE."""
     found = [(row.trigger, row.options(situation)) for row in TABLE if row.occurs(situation)]
     found = [
@@ -416,6 +431,8 @@ def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
     # The fallback of a mode is not a table row: it depends on several parameters.
     fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
     if fallback is not FailsafeAction.NONE:
-        options = Options(fallback, takeover=Takeover.ALWAYS)
+        options = failsafe_conditions.Options(
+            fallback, takeover=failsafe_conditions.Takeover.ALWAYS
+        )
         found.append((Trigger.MODE_FALLBACK, options))
     return found

@@ -17,8 +17,8 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.climb import SETTLED_M, ClimbLimits
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ClimbOn, ModeRequest, PositionYaw, Reposition
 from firmware_sim.autopilot.modes import interface
+from firmware_sim.autopilot.modes.interface import ClimbOn, ModeRequest, PositionYaw, Reposition
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, stopping_place, triple
 from firmware_sim.engine.record import RISING, SETTLING
 

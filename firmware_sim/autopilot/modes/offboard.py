@@ -17,9 +17,9 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.error_state import RATES
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ModeRequest
 from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.modes.automatic import Hold
+from firmware_sim.autopilot.modes.interface import ModeRequest
 
 CLIMBS_M_S = 0.1
 """Minimum climb rate of a setpoint that lifts a standing vehicle [m/s]."""

@@ -18,9 +18,8 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, PrecisionRequest
+from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.modes.automatic import landing_speed
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, optional_mode
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 _REQUIRED = 2
@@ -36,20 +35,20 @@ class _Stage(Enum):
     LAND = auto()
 
 
-class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
+class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
     """Return mode: climbs, flies home and lands."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
-        self._start = PositionYaw((0.0, 0.0, 0.0), 0.0)
+        self._start = interface.PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._stage = _Stage.CLIMB
         self._waiting_since_us: int | None = None
         self._down = 0.0
         """Height of the flight home, NED [m]."""
-        self._home = PositionYaw((0.0, 0.0, 0.0), 0.0)
-        self._mission = optional_mode(Mode.MISSION, context)
-        self._precision = optional_mode(Mode.PRECISION_LAND, context)
-        self._instead: FlightMode | None = None
+        self._home = interface.PositionYaw((0.0, 0.0, 0.0), 0.0)
+        self._mission = interface.optional_mode(Mode.MISSION, context)
+        self._precision = interface.optional_mode(Mode.PRECISION_LAND, context)
+        self._instead: interface.FlightMode | None = None
         """Mode that flies: Mission along mission items, Precision Landing at the end."""
 
     @property
@@ -64,17 +63,17 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
             return north, east, self._down
         return north, east, ground if self._stage is _Stage.LAND else self._waiting_down
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start with the climb, if needed."""
         context = self._context
-        home = PositionYaw(context.home, context.home_yaw)
+        home = interface.PositionYaw(context.home, context.home_yaw)
         chosen = home if context.return_place is None else context.return_place()
         self._instead = self._mission if chosen is None else None
         if self._instead is not None:
             self._instead.enter(state, None)
             return
         self._home = chosen or home
-        self._start = here(state)
+        self._start = interface.here(state)
         self._waiting_since_us = None
         height = self._height(state)
         at = return_height(context.value, height, self._away(state))
@@ -143,7 +142,7 @@ class ReturnToLaunch(FlightMode, modes=(Mode.RETURN,)):
         option = round(self._context.value("RTL_PLD_MD"))
         if option > 0 and self._precision is not None:
             north, east, down = *self._home.position[:2], state.item(P + 2)
-            request = PrecisionRequest((north, east, down), required=option == _REQUIRED)
+            request = interface.PrecisionRequest((north, east, down), required=option == _REQUIRED)
             self._precision.enter(state, request)
             self._instead = self._precision
         elif option > 0:

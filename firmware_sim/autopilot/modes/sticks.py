@@ -18,8 +18,7 @@ from airl_mav.vehicle.rotation import multiply
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.inputs import ModeRequest, Sticks
-from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, descend, since
+from firmware_sim.autopilot.modes import interface
 from firmware_sim.autopilot.smooth_trajectory import Axis, triple
 
 _TURNS_RAD_S = 1e-3
@@ -65,11 +64,11 @@ class YawStick:
     def __init__(self, value: Callable[[str], float]) -> None:
         self._value = value
         self._rate = 0.0
-        self._held = NAN
+        self._held = interface.NAN
 
     def restart(self) -> None:
         """Reset rate and held heading."""
-        self._rate, self._held = 0.0, NAN
+        self._rate, self._held = 0.0, interface.NAN
 
     def turn(self, stick: float, yaw: float, dt: float) -> tuple[float, float]:
         """Return the heading [rad], NaN while turning, and the yaw rate [rad/s]."""
@@ -78,7 +77,7 @@ class YawStick:
         target = shaped * value("MPC_MAN_Y_MAX") * DEG
         self._rate += (target - self._rate) * dt / (dt + value("MPC_MAN_Y_TAU"))
         if abs(self._rate) > _TURNS_RAD_S:
-            self._held = NAN
+            self._held = interface.NAN
         elif math.isnan(self._held):
             self._held = wrap_pi(yaw)
         return self._held, self._rate
@@ -90,12 +89,12 @@ class VerticalStick:
     def __init__(self, value: Callable[[str], float]) -> None:
         self._value = value
         self._axis = Axis()
-        self._held = NAN
+        self._held = interface.NAN
 
     def restart(self, down: float, velocity: float) -> None:
         """Start with a position [m] and velocity [m/s], NED."""
         self._axis.restart(down, velocity)
-        self._held = NAN
+        self._held = interface.NAN
 
     def move(self, stick: float, down: float, height: float, dt: float) -> AxisDemand:
         """Return the demand, NED, from measured `down` and `height` above home [m]."""
@@ -108,7 +107,7 @@ class VerticalStick:
             if math.isnan(self._held):
                 self._held = axis.position
         else:
-            self._held = NAN
+            self._held = interface.NAN
             axis.position = down
         limit = value("MPC_ACC_UP_MAX") if target < 0.0 else value("MPC_ACC_DOWN_MAX")
         axis.plan(target, limit, value("MPC_JERK_MAX"))
@@ -142,13 +141,13 @@ class HorizontalStick:
         self._value = value
         self._velocity = (0.0, 0.0)
         self._acceleration = (0.0, 0.0)
-        self._held = (NAN, NAN)
+        self._held = (interface.NAN, interface.NAN)
         self._boost = 1.0
 
     def restart(self, velocity: tuple[float, float]) -> None:
         """Start with a velocity NED [m/s]."""
         self._velocity, self._acceleration = velocity, (0.0, 0.0)
-        self._held, self._boost = (NAN, NAN), 1.0
+        self._held, self._boost = (interface.NAN, interface.NAN), 1.0
 
     def move(
         self,
@@ -183,7 +182,7 @@ class HorizontalStick:
             vn, ve = 0.0, 0.0
         self._velocity = vn, ve
         if math.hypot(vn, ve) > 1e-3:
-            self._held = NAN, NAN
+            self._held = interface.NAN, interface.NAN
         elif math.isnan(self._held[0]):
             self._held = position
         pairs = zip(self._held, self._velocity, self._acceleration, strict=True)
@@ -264,7 +263,7 @@ class TerrainHold:
         """Reset the hold."""
         self.holds = False
         """True if the height above ground is held instead of the altitude."""
-        self.locked_m = NAN
+        self.locked_m = interface.NAN
         """Held height above ground; NaN = none."""
         self._resets: int | None = None
 
@@ -274,7 +273,7 @@ class TerrainHold:
             self.restart()
             return held
         if now.resets != self._resets:
-            self._resets, self.locked_m = now.resets, NAN
+            self._resets, self.locked_m = now.resets, interface.NAN
         is_known, limit = math.isfinite(now.ground_m), self._value("MPC_HOLD_MAX_XY")
         deflected = now.level > _DEFLECTED
         if self.holds:
@@ -287,7 +286,7 @@ class TerrainHold:
                 self.locked_m = now.ground_m - (held - now.down_m)
         if not self.holds:
             if not now.climbing and math.isnan(held):
-                self.locked_m = NAN
+                self.locked_m = interface.NAN
             return held
         return self._follow(now)
 
@@ -295,7 +294,7 @@ class TerrainHold:
         slow = self._value("MPC_HOLD_MAX_Z")
         stopped = slow <= 0.0 or abs(now.climb_m_s) < slow
         if now.climbing:
-            self.locked_m = NAN
+            self.locked_m = interface.NAN
         elif math.isnan(self.locked_m) and stopped:
             self.locked_m = now.ground_m
         return now.down_m - (self.locked_m - now.ground_m)
@@ -305,10 +304,10 @@ LIFTING_THROTTLE = 0.3
 """Minimum deflection for a take-off: PX4's 65 % of the stick's travel."""
 
 
-class Piloted(FlightMode):
+class Piloted(interface.FlightMode):
     """Stick mode; without pilot input it descends level."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._vertical = VerticalStick(context.value)
         self._turning = YawStick(context.value)
@@ -322,7 +321,7 @@ class Piloted(FlightMode):
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > LIFTING_THROTTLE
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start with the current motion."""
         self._restart(state)
 
@@ -335,12 +334,12 @@ class Piloted(FlightMode):
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return the demand of the sticks."""
         sticks = self._context.sticks
-        dt, self._time_us = since(self._time_us, time_us), time_us
+        dt, self._time_us = interface.since(self._time_us, time_us), time_us
         if sticks is None:
             yaw = self._yaw
             self._restart(state)
             self._yaw = yaw
-            return descend(yaw)
+            return interface.descend(yaw)
         now = quat_yaw(state[Q:RATES])
         yaw, rate = self._turning.turn(sticks.yaw, now, dt)
         height = self._context.over_ground(state)
@@ -356,7 +355,7 @@ class Piloted(FlightMode):
             rate,
         )
 
-    def _over_ground(self, sticks: Sticks, state: Vector, z: AxisDemand) -> AxisDemand:
+    def _over_ground(self, sticks: interface.Sticks, state: Vector, z: AxisDemand) -> AxisDemand:
         """Return the vertical demand, which holds the height above ground if enabled."""
         value, hold, (vn, ve, vd) = self._context.value, self._terrain, triple(state, V)
         zone = value("MPC_HOLD_DZ")
@@ -380,7 +379,7 @@ class Piloted(FlightMode):
 
     @abstractmethod
     def _steer(
-        self, sticks: Sticks, heading: float, state: Vector, dt: float, /
+        self, sticks: interface.Sticks, heading: float, state: Vector, dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
         """Return the motion north and east commanded by pitch and roll."""
 
@@ -389,7 +388,7 @@ class Altitude(Piloted, modes=(Mode.ALTITUDE,)):
     """Tilt proportional to the sticks."""
 
     def _steer(
-        self, sticks: Sticks, heading: float, _state: Vector, _dt: float, /
+        self, sticks: interface.Sticks, heading: float, _state: Vector, _dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
         tilt = min(89.0, self._context.value("MPC_MAN_TILT_MAX")) * DEG
         most = min(3.0, max(0.02, math.tan(tilt))) * GRAVITY_M_S2
@@ -397,7 +396,9 @@ class Altitude(Piloted, modes=(Mode.ALTITUDE,)):
         forward, right = sticks.pitch / length * most, sticks.roll / length * most
         c, s = math.cos(heading), math.sin(heading)
         north, east = c * forward - s * right, s * forward + c * right
-        return AxisDemand(NAN, NAN, north), AxisDemand(NAN, NAN, east)
+        return AxisDemand(interface.NAN, interface.NAN, north), AxisDemand(
+            interface.NAN, interface.NAN, east
+        )
 
 
 class Position(Piloted, modes=(Mode.POSITION,)):
@@ -406,11 +407,11 @@ class Position(Piloted, modes=(Mode.POSITION,)):
     prevents_collisions = False
     """True if CP_DIST is observed, by an add-on."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         super().__init__(context)
         self._horizontal = HorizontalStick(context.value)
 
-    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, request: interface.ModeRequest | None, /) -> None:
         """Start with the current motion."""
         super().enter(state, request)
         if not self.prevents_collisions and self._context.value("CP_DIST") > 0.0:
@@ -423,7 +424,7 @@ class Position(Piloted, modes=(Mode.POSITION,)):
         self._horizontal.restart((north, east))
 
     def _steer(
-        self, sticks: Sticks, heading: float, state: Vector, dt: float, /
+        self, sticks: interface.Sticks, heading: float, state: Vector, dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
         north, east, _ = triple(state, P)
         deflected = sticks.pitch, sticks.roll
@@ -438,14 +439,14 @@ class Position(Piloted, modes=(Mode.POSITION,)):
 IDLE_THROTTLE = -0.9
 """Deflection below which a standing vehicle stays, and its heading setpoint follows the heading."""
 
-RELEASED = Sticks(0.0, 0.0, 0.0, 0.0)
+RELEASED = interface.Sticks(0.0, 0.0, 0.0, 0.0)
 """Centred sticks, used after stick loss until the failsafe acts."""
 
 
-class Stabilized(FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
+class Stabilized(interface.FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
     """Tilt proportional to the sticks, thrust from the throttle stick."""
 
-    def __init__(self, context: FlightContext, /) -> None:
+    def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
         self._yaw = 0.0
         self._time_us: int | None = None
@@ -456,14 +457,14 @@ class Stabilized(FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
         sticks = self._context.sticks
         return sticks is not None and sticks.throttle > IDLE_THROTTLE
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start with the current heading."""
         self._yaw, self._time_us = quat_yaw(state[Q:RATES]), None
 
     def demand(self, state: Vector, time_us: int, /) -> AttitudeDemand:
         """Return the demand of the sticks."""
         value, sticks = self._context.value, self._context.sticks or RELEASED
-        dt, self._time_us = since(self._time_us, time_us), time_us
+        dt, self._time_us = interface.since(self._time_us, time_us), time_us
         rate = sticks.yaw * value("MPC_MAN_Y_MAX") * DEG
         if sticks.throttle < IDLE_THROTTLE:
             self._yaw = quat_yaw(state[Q:RATES])

@@ -18,8 +18,13 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Home
-from firmware_sim.autopilot.inputs import ModeRequest, PositionYaw, Reposition
-from firmware_sim.autopilot.modes.interface import FlightContext, here
+from firmware_sim.autopilot.modes.interface import (
+    FlightContext,
+    ModeRequest,
+    PositionYaw,
+    Reposition,
+    here,
+)
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
 from firmware_sim.autopilot.navigation import plan
 from firmware_sim.autopilot.navigation.geofence import FenceMonitor

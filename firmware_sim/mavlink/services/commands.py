@@ -18,7 +18,7 @@ from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
-from firmware_sim.autopilot.inputs import OrbitRequest, PositionYaw, Reposition
+from firmware_sim.autopilot.modes.interface import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.streams.units import INT32_MAX

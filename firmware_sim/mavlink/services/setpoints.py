@@ -17,7 +17,7 @@ from airl_mav.core import frames
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, Severity, Vector, Wire
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.inputs import FollowedTarget, Source, Sticks
+from firmware_sim.autopilot.modes.interface import FollowedTarget, Source, Sticks
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import Context, Handlers, for_anyone, for_vehicle_or_all
 
