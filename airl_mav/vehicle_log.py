@@ -165,8 +165,10 @@ def read_vehicle_log(path: Path) -> VehicleLog:
         raise UsageError(f"{path}: {error.strerror}") from None
     except _BROKEN:
         raise UsageError(f"{path}: accepted: {accepted}") from None
+    # First instance of each topic; reversed, so that the first entry wins.
     topics = {each.name: each.data for each in reversed(read.data_list) if each.multi_id == 0}
     series = {name: _series(topics, *columns) for name, columns in _SERIES.items()}
+    # Alignment needs a course of both.
     if len(series["attitude"]) < 2 or len(series["motion"]) < 2:
         raise UsageError(f"{path}: accepted: {accepted}")
     # Either topic may have more samples.
@@ -174,6 +176,7 @@ def read_vehicle_log(path: Path) -> VehicleLog:
     trajectory = _series(topics, "trajectory_setpoint", velocity)
     series["setpoint"] = max(series["setpoint"], trajectory, key=len)
     battery = series["battery"].values
+    # An unmeasured current must not look like a small one.
     battery[battery[:, 1] == UNMEASURED_A, 1] = np.nan
     known = {name: each if name in _PARTLY_NAN else _known(each) for name, each in series.items()}
     return VehicleLog(
@@ -189,6 +192,7 @@ def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Ser
         return empty(len(fields))
     # Values belong to the sample's time; `timestamp` is the later time of publication.
     times = np.asarray(data.get("timestamp_sample", data["timestamp"]), np.int64)
+    # Interpolation needs increasing times: repeated and late samples are dropped.
     later = np.diff(times, prepend=-1) > 0
     values = np.stack([np.asarray(data[name], np.float64) for name in fields], axis=1)
     return Series(times[later], values[later])
@@ -262,6 +266,7 @@ def align(
     commands: CommandKind = "velocity",
 ) -> ClockAlignment:
     """Return the clock relation of a recorded flight and its vehicle's log, or raise UsageError."""
+    # The coarse search over all shifts avoids local minima of the fine one.
     told_us = _refined(path, log, _coarse(path, log))
     flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
     inside = _inside(path, log, told_us)
@@ -273,6 +278,7 @@ def align(
             f"best; accepted: the log of the same flight, {LEAST_CORRELATION:g} or more"
         )
     low_us, high_us, count = _accepted(sent_us, setpoints, commands, log, told_us)
+    # One or two matches may be coincidence.
     known = count >= LEAST_SETPOINTS
     return ClockAlignment(
         told_us=told_us,
@@ -292,11 +298,13 @@ def _coarse(path: Trajectory, log: VehicleLog) -> float:
     ]
     told = np.stack([np.interp(times[0], path.time_us, each) for each in path.velocity.T])
     logged = log.motion.at(times[1])[:, 3:].T
+    # Without motion every shift correlates equally well.
     if min(len(each) for each in times) < 2 or np.abs(told).max() < LEAST_SPEED_M_S:
         raise UsageError(
             f"{log.path}: the clocks cannot be aligned; accepted: a flight with motion of "
             f"{LEAST_SPEED_M_S:g} m/s or more"
         )
+    # All three axes add up: one alone may be constant.
     score = sum(correlate(a, b) for a, b in zip(told, logged, strict=True))
     lag = correlation_lags(len(times[0]), len(times[1]))[int(np.argmax(score))]
     return float(times[0][0] - times[1][0] + lag * GRID_US)
@@ -311,9 +319,11 @@ def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
         leaning = _down_and_nose(path.quaternion[inside])
         logged = _down_and_nose(log.attitude.at(times))
         moved = path.velocity[inside] - log.motion.at(times)[:, 3:]
+        # Both residuals are divided by their spread, so neither unit dominates.
         turned = (leaning - logged) / max(float(leaning.std()), 1e-3)
         return float(np.mean(turned**2) + np.mean((moved / path.velocity[inside].std()) ** 2))
 
+    # Beyond the coarse grid's step, as its maximum may be one step off.
     bounds = (coarse_us - FINE_US, coarse_us + FINE_US)
     return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 50.0}).x)
 
@@ -345,6 +355,7 @@ def _inside(path: Trajectory, log: VehicleLog, shift_us: float) -> NDArray[np.bo
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     power = float(np.sum(a * a) * np.sum(b * b))
+    # Without the means: a constant velocity is a signal, too.
     return float(np.sum(a * b) / np.sqrt(power)) if power > 0.0 else 0.0
 
 
@@ -402,6 +413,7 @@ def _bounds(
 ) -> list[tuple[float, float]]:
     """Return intervals [µs] after the expected times (k,) in which setpoints enter the log."""
     bounds = []
+    # From the second setpoint on: a match needs a change.
     for k in range(1, len(sent)):
         if (np.abs(sent[k] - sent[k - 1]) < 2.0 * near).all():
             continue  # The log shows no change.
@@ -411,6 +423,8 @@ def _bounds(
         )
         same = (np.abs(seen.values[window] - sent[k]) < near).all(axis=1)
         first = int(np.argmax(same)) if same.any() else 0
+        # The change happened between two log samples: both bound its time. At the first sample the
+        # lower bound is missing.
         if first > 0:
             times = seen.time_us[window][first - 1 : first + 1] - expected_us[k]
             bounds.append((float(times[0]), float(times[1])))
@@ -420,10 +434,12 @@ def _bounds(
 def marzullo(bounds: NDArray[np.float64]) -> tuple[float, float, int]:
     """Return the interval covered by most of the intervals (n, 2), and their number."""
     edges = [(low, -1) for low in bounds[:, 0]] + [(high, 1) for high in bounds[:, 1]]
+    # At equal times begins sort before ends (-1 < 1): touching intervals overlap.
     edges.sort()
     open_now, best, found = 0, 0, (0.0, 0.0)
     for i, (at, kind) in enumerate(edges):
         open_now -= kind
+        # The interval of maximum overlap ends at the next edge.
         if kind == -1 and open_now > best:
             best, found = open_now, (float(at), float(edges[i + 1][0]))
     return found[0], found[1], best

@@ -81,6 +81,8 @@ class EpisodeSaver:
     def add(self, episode: FlownEpisode) -> None:
         """Add an episode; blocks while the queue is full. Raises the error of a failed save."""
         with self._changed:
+            # A bounded queue: episodes must not fill the memory if the disk is slower than the
+            # flights.
             self._changed.wait_for(lambda: len(self._waiting) < MAX_WAITING or self._error)
             self._raise_error()
             self._waiting.append(episode)
@@ -97,6 +99,7 @@ class EpisodeSaver:
         try:
             while not ending:
                 ending, episodes = self._collect(interval_s)
+                # Slow disks get fewer, larger saves.
                 interval_s = max(INTERVAL_S, INTERVAL_PER_SAVE * self._save(episodes))
         except BaseException as error:  # Raised again in the caller's thread.
             with self._changed:
@@ -109,6 +112,7 @@ class EpisodeSaver:
             self._changed.wait_for(
                 lambda: self._ending or len(self._waiting) >= MAX_WAITING, interval_s
             )
+            # Taken under the lock, saved without it: flights continue during the save.
             episodes, self._waiting = self._waiting, []
             self._changed.notify_all()
             return self._ending, episodes
@@ -180,6 +184,7 @@ class Cell:
     def __post_init__(self) -> None:
         """Raise UsageError if the level's environment does not support the scenario."""
         if self.scenario.scenario.level in FLIERS:
+            # Report unsupported scenarios before the first flight of the campaign.
             _ = self.flier
 
     @property
@@ -247,6 +252,7 @@ def run_cells(
     each complete cell, also if it was complete before.
     """
     first_of = shared_flights(cells)
+    # Equal flights are flown once.
     unique = [cell for cell in cells if first_of[cell.name] is cell]
     paths = {cell.name: root.absolute() / cell.name for cell in unique}
     run = _run(paths, unique, executor, progress or Progress(), stop, ended)
@@ -267,6 +273,7 @@ def shared_flights(cells: Sequence[Cell]) -> dict[str, Cell]:
         mine = cell.scenario
         for first in firsts:
             theirs = first.scenario
+            # Seeds first: comparing configurations is slower.
             if theirs.seeds == mine.seeds and not run_folder.another_config(
                 theirs.config, mine.config
             ):
@@ -320,6 +327,7 @@ class _OpenCell:
         self.stack = ExitStack()
         with ExitStack() as stack:
             say = partial(progress.note, style="yellow")
+            # Lock before reading: another process may be saving its last episode.
             stack.enter_context(nullcontext() if out is None else locked(out, say))
             self.folder, self.done = run_folder.open_folder(out, cell.name, cell.scenario)
             planned = len(cell.scenario.seeds)
@@ -331,6 +339,7 @@ class _OpenCell:
             self._saver = stack.enter_context(EpisodeSaver(self.folder))
             self._tally = Tally(progress, cell.title, self.folder.path, self.done, planned)
             stack.callback(self._tally.close)
+            # Only a fully opened cell keeps its lock; an error before releases it.
             self.stack = stack.pop_all()
         self.episodes = {record.index: record for record in self.done}
 
@@ -348,6 +357,7 @@ class _OpenCell:
 
     def run(self) -> CellRun:
         """Return the results so far."""
+        # Workers finish in any order; results are in the order of seeds.
         episodes = tuple(self.episodes[index] for index in sorted(self.episodes))
         return CellRun(self.cell, self.folder.path, episodes, len(episodes) - len(self.done))
 
@@ -373,7 +383,9 @@ def _run(
         def open_cell(cell: Cell) -> _OpenCell:
             nonlocal planned
             new = opened[cell.name] = _OpenCell(cell, paths[cell.name], progress)
+            # Closes the cell at any exit, so no saved flight is lost.
             stack.push(new.stack)
+            # Earlier flights do not count for the estimate of the remaining time.
             planned -= len(new.done)
             everything.update(total=planned)
             return new
@@ -389,10 +401,14 @@ def _run(
                 if not left:
                     close(flying)
                     continue
+                # Compile here, once, or every worker would compile the same kernels.
                 compile_first([plan_of(cell.scenario)], progress, stop)
                 size = len(left)
+                # Executors that stream results take whole cells; others return a job's results at
+                # its end.
                 if not executor.streams:
                     size = cell.flier.episodes_per_job(len(left), executor.workers)
+                # Workers may have another working directory.
                 folder = run_folder.RunFolder(flying.folder.path.absolute())
                 for i in range(0, len(left), size):
                     yield _Job(cell.name, folder, tuple(left[i : i + size]))
@@ -412,6 +428,7 @@ def _run(
             compiling=lambda begins: progress.status(COMPILING if begins else None),
         )
         try:
+            # Stops the workers before the folders are closed.
             with closing(results):
                 for job, episode in results:
                     flying = opened[job.cell]
@@ -426,6 +443,7 @@ def _run(
     ended: Ended = "complete"
     if error is not None:
         ended = "broken off"
+    # A stop after the last flight also counts: subsequent work must not start.
     elif not complete or stop():
         ended = "interrupted"
     return CampaignRun(tuple(runs), complete, ended, error)
@@ -462,6 +480,7 @@ class Declaration:
     def __post_init__(self) -> None:
         """Raise ValueError for a cell name that is not a valid folder name."""
         for name in self.cells:
+            # A cell must not write outside the campaign's folder, or over its file.
             if Path(name).name != name or name in ("", "..", CAMPAIGN_FILE):
                 raise ValueError(f"cell {name!r}: accepted: the name of a folder")
 
@@ -510,6 +529,7 @@ def open_campaign(
                 "the same settings to go on"
             )
         campaign = Campaign(declaration, held.made if held else provenance(command))
+        # An unchanged file keeps its date.
         if campaign != held:
             write_json(path / CAMPAIGN_FILE, asdict(campaign))
         yield campaign
@@ -524,9 +544,11 @@ def _difference(
     if difference := another_config(held.settings, asked.settings, free):
         return difference
     for name, cell in asked.cells.items():
+        # New cells may join a campaign.
         if (theirs := held.cells.get(name)) is None:
             continue
         old, new = theirs.settings, cell.settings
+        # More episodes continue a cell; fewer would contradict its folder.
         grown = {each for each in growing if old.get(each, 0) < new.get(each, 0)}
         if difference := another_config(old, new, {*free, *grown}):
             return f"another cell {name}: {difference}"

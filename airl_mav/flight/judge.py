@@ -127,14 +127,18 @@ class Referee:
     def _judge(self, sample: TruthSample) -> tuple[Outcome, str] | None:
         """Return outcome and reason of this sample, or None."""
         task = self.task
+        # Samples may arrive after the start of navigation, but be older.
         flying = self.navigation_us is not None and sample.time_us >= self.navigation_us
         if flying:
             distance = goal_distance_m(task.goal, sample.position)
+            # Goal first: a vehicle that reaches the goal and hits it in the same sample has
+            # succeeded.
             if distance < task.goal_radius_m:
                 return Outcome.SUCCESS, f"{distance:.2f} m from the goal"
         if sample.collision is not None:
             phase = "" if flying else " during the take-off"
             return Outcome.COLLISION, f"hit {sample.collision}{phase}"
+        # Before the time limit: an empty battery explains a slow flight.
         if sample.battery_remaining <= 0.0:
             return Outcome.BATTERY, "battery empty"
         if flying and sample.time_us - (self.navigation_us or 0) >= task.time_limit_s * US_PER_S:
@@ -228,12 +232,14 @@ def host_figures(
     """
     whole_us, late_us = flight_us + slipped_us, LATE_FRAMES * frame_period_us
     began_us, held_us = decisions.get("infer_start_us"), decisions.get("held_until_us")
+    # Without decisions there is nothing to disturb.
     stale = late = None
     if began_us is not None and "capture_us" in decisions:
         stale = _share_beyond(decisions["capture_us"], began_us, late_us, excused)
     if began_us is not None and held_us is not None:
         # The end of each hold time, and the start of the next decision.
         late = _share_beyond(held_us[:-1], began_us[1:], late_us, excused)
+    # A high percentile: one late tick is harmless, one in a hundred shows an overloaded host.
     ticks = lateness_us.size
     return HostFigures(
         given_up=slipped_us / whole_us if whole_us > 0 else 0.0,
@@ -264,8 +270,10 @@ def _share_beyond(
     excused: Sequence[tuple[int, int]],
 ) -> float | None:
     """Return the share of intervals over a limit, without excused times; None: no interval."""
+    # Decisions without a frame or an end have no interval.
     both = (first != NO_STAMP) & (last != NO_STAMP)
     for from_us, to_us in excused:
+        # An interval that touches an excused time is left out entirely.
         both &= (last < from_us) | (first > to_us)
     if not both.any():
         return None

@@ -101,6 +101,7 @@ def wilson(successes: int, n: int) -> Estimate:
     denominator = 2.0 * (n + z2)
     centre = (2.0 * n * rate + z2) / denominator
     half = QUANTILE / denominator * math.sqrt(4.0 * n * rate * (1.0 - rate) + z2)
+    # Exact ends: rounding of the closed form would miss 0 and 1.
     low = 0.0 if successes == 0 else centre - half
     high = 1.0 if successes == n else centre + half
     return Estimate(rate, low, high, n)
@@ -115,8 +116,10 @@ def bootstrap_mean(values: ArrayLike) -> Estimate:
     if not data.size:
         return NO_ESTIMATE
     mean = float(data.mean())
+    # One value has no spread to resample.
     if data.size == 1:
         return Estimate(mean, None, None, 1)
+    # The bias correction is undefined without spread.
     if np.ptp(data) == 0.0:
         return Estimate(mean, mean, mean, data.size)
     return Estimate(mean, *bootstrap_interval((data,), lambda means: means), data.size)
@@ -133,11 +136,15 @@ def bootstrap_interval(
     equal, each (n,), n >= 2; `statistic` takes the means (k,) of each.
     """
     n = samples[0].size
+    # The same indices for all samples keep pairs together; the seed makes reports reproducible.
     draws = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (RESAMPLES, n))
     resampled = statistic(*(sample[draws].mean(axis=-1) for sample in samples))
     observed = statistic(*(sample.mean(keepdims=True) for sample in samples))
+    # Jackknife means in closed form: O(n) memory.
     without_one = statistic(*((sample.sum() - sample) / (n - 1) for sample in samples))
+    # Ties count half: discrete data have many of them.
     below = 0.5 * (np.mean(resampled < observed) + np.mean(resampled <= observed))
+    # Limited to half a resample: the quantile of 0 or 1 is infinite.
     bias = NORMAL.inv_cdf(min(max(float(below), 0.5 / RESAMPLES), 1.0 - 0.5 / RESAMPLES))
     influence = without_one.mean() - without_one
     spread = float((influence**2).sum()) ** 1.5
@@ -163,6 +170,7 @@ def median_of(values: ArrayLike) -> Estimate:
     if not n:
         return NO_ESTIMATE
     # Maximum number of values that may be left out on either side.
+    # Two-sided: half of the error probability on each side.
     out = _binomial_quantile(0.5 * (1.0 - CONFIDENCE), n) - 1
     middle = float(np.median(data))
     if out < 0:
@@ -174,6 +182,7 @@ def _binomial_quantile(probability: float, n: int) -> int:
     """Return the minimum number of heads in n coin tosses with this cumulative probability."""
     heads = np.arange(n)
     steps = np.log(n - heads) - np.log1p(heads)
+    # Logarithms, because the binomial coefficients overflow beyond about 1000 values.
     logarithms = np.concatenate([[0.0], np.cumsum(steps)]) - n * math.log(2.0)
     return int(np.searchsorted(np.cumsum(np.exp(logarithms)), probability))
 
@@ -190,7 +199,9 @@ def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     for episode in flown:
         outcomes[episode.outcome] += 1
     reached = reached_goals(episodes)
+    # Times and energies of failed flights depend on when they ended.
     good = successful(flown)
+    # Deadline misses do not depend on the outcome, so failed flights count, too.
     qualities = [episode.quality for episode in flown if episode.quality is not None]
     return Aggregate(
         success_rate=wilson(sum(reached), len(reached)),
@@ -330,6 +341,7 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
 
     def end(limit: float) -> float:
         # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
+        # The interval ends at the limit itself: bisection has no interior point.
         if value == limit:
             return limit
         inside, outside = value, limit
@@ -346,6 +358,7 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
 
 def _score(d: float, gained: int, lost: int, n: int) -> float:
     """Return Tango's score statistic of a difference d, -1 to 1."""
+    # Zero numerator first: the variance may be zero, too.
     away = gained - lost - n * d
     if away == 0.0:
         return 0.0
@@ -371,8 +384,10 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
     if n == 0:
         return NO_ESTIMATE
     value = percent_change(float(first.mean()), float(second.mean()))
+    # One pair has a difference, but no interval.
     if n == 1:
         return Estimate(value, None, None, 1)
+    # Equal ratios up to rounding: resampling would amplify rounding errors.
     if np.ptp(second / first) <= SAME_RATIO:
         return Estimate(value, value, value, n)
     return Estimate(value, *bootstrap_interval((first, second), _percent), n)
@@ -401,6 +416,8 @@ def _known_by_both(
 ) -> tuple[list[float], list[float]]:
     """Return a measure of the pairs in which both flights have it."""
     values = [(getattr(first, name), getattr(second, name)) for first, second in good]
+    # A pair counts only if both flights have the measure; otherwise means would compare different
+    # seeds.
     both = [pair for pair in values if None not in pair]
     return [first for first, _ in both], [second for _, second in both]
 

@@ -63,6 +63,7 @@ class Trajectory:
         if end < start:
             return self.at(np.zeros(0, np.int64))
         inside = self.time_us[(self.time_us > start) & (self.time_us < end)]
+        # Both ends are interpolated: a flight rarely begins or ends at a sample.
         return self.at(np.unique(np.concatenate([[start], inside, [end]]).astype(np.int64)))
 
     def at(self, times: NDArray[np.int64]) -> Trajectory:
@@ -83,6 +84,7 @@ class Trajectory:
     def _continuous_quaternion(self) -> NDArray[np.float64]:
         """Return the quaternions with signs flipped so that neighbours lie close."""
         dots = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1)
+        # q and -q are the same attitude; a change of sign would interpolate through zero.
         signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
         near: NDArray[np.float64] = self.quaternion * np.concatenate([[1.0], signs])[:, None]
         return near
@@ -171,6 +173,7 @@ def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
     """Measure the part of a flight between two simulated times [µs]."""
     part = trajectory.between(start_us, end_us)
     steps_s = np.diff(part.time_us) / US_PER_S
+    # Power belongs to the step that ends at a sample, so the first value is left out.
     energy_j = float(np.sum(part.power_w[1:] * steps_s))
     return Leg(
         time_s=(end_us - start_us) / US_PER_S,
@@ -199,9 +202,11 @@ def measure_quality(
         raise ValueError(f"ended_us={ended_us} lies before navigation_us={navigation_us}")
     leg = measure_leg(trajectory, navigation_us, ended_us)
     speed = trajectory.between(navigation_us, ended_us).speed()
+    # Recordings may begin after the start of navigation.
     began_us = min(int(trajectory.time_us[0]), navigation_us) if len(trajectory) else navigation_us
     computer_j = computer_watts * leg.time_s
     spent_j = 0.0 if leg.energy_j is None else leg.energy_j + computer_j
+    # Vehicle and computer drain the same pack.
     missions = None if pack_j is None or spent_j <= 0.0 else pack_j / spent_j
     return Quality(
         flight_time_s=leg.time_s,
@@ -233,6 +238,7 @@ def _conduct(
     if SETPOINT in decisions:
         commanded = jerk_of(commanded_velocity(trajectory, decisions, times_us))
     misses = None
+    # Without a hold time decisions have no deadline.
     if hold_s > 0.0:
         misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * US_PER_S)
     return {
@@ -281,6 +287,7 @@ class Jerk:
 
 def jerk_of(velocity: NDArray[np.float64]) -> Jerk | None:
     """Return the jerk of velocities (n, 3) [m/s], sampled at 50 Hz; None with too few samples."""
+    # Shorter flights have no sample with a full window.
     if len(velocity) < len(_KERNEL):
         return None
     columns = [np.convolve(column, _KERNEL, "valid") for column in velocity.T]
@@ -297,6 +304,7 @@ def sample_times(trajectory: Trajectory, start_us: int, end_us: int) -> NDArray[
     inside = trajectory.time_us[(trajectory.time_us >= start_us) & (trajectory.time_us <= end_us)]
     if not inside.size:
         return np.zeros(0, np.int64)
+    # Even steps: the convolution assumes a constant rate.
     return np.arange(inside[0], inside[-1] + 1, SAMPLE_US, dtype=np.int64)
 
 
@@ -317,8 +325,10 @@ def commanded_velocity(
     `setpoint` of `latency.npz`.
     """
     sent_us, setpoints = _sent(decisions)
+    # Row 0 is the command before the first one was sent.
     commands = np.vstack([np.zeros(3), setpoints])
     flown = commands[np.searchsorted(sent_us, times_us, side="right")]
+    # Unwrapped, so that interpolation does not turn the long way round at 180 degrees.
     headings = np.unwrap(quats_to_euler(trajectory.quaternion)[2])
     return heading_to_ned(flown, np.interp(times_us, trajectory.time_us, headings))
 
@@ -338,5 +348,6 @@ def _sent(decisions: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDA
     """Return times (k,) [µs] and velocities (k, 3) [m/s] of the sent commands."""
     if "sent_us" not in decisions or SETPOINT not in decisions:
         return np.zeros(0, np.int64), np.zeros((0, 3))
+    # The last decision of an interrupted flight may not have been sent.
     sent = decisions["sent_us"] != NO_STAMP
     return decisions["sent_us"][sent], decisions[SETPOINT][sent, :3].astype(np.float64)

@@ -206,6 +206,7 @@ class Layout:
         for field, (value, accepted) in self.only.items():
             if (given := getattr(spec, field, value)) != value:
                 shown = ", ".join(given) if isinstance(given, dict) else repr(given)
+                # As written in TOML.
                 shown = shown.lower() if isinstance(given, bool) else shown
                 return f"{field} = {shown}: accepted: {accepted} with layout {name!r}"
         return None
@@ -230,6 +231,7 @@ class Layout:
             spec.further_keys[name]: Box.of_image(each.channels, each.height_px, each.width_px)
             for name, each in spec.cameras.items()
         }
+        # Sorted by key: the order of the network's inputs must not depend on the profile's order.
         return found | dict(sorted(further.items()))
 
     def encode(self, spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
@@ -255,6 +257,7 @@ class Layout:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return velocity (n, 3) and goal (n, `spec.goal_numbers`) of n vehicles."""
         distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
+        # The bearing of a goal straight below is undefined: no division by zero.
         safe = np.maximum(distance, LEAST_DISTANCE_M)
         goal = [seen.goal[:, 0] / safe, seen.goal[:, 1] / safe, distance / DISTANCE_SCALE_M]
         if spec.goal_height:
@@ -287,6 +290,7 @@ class PaperLayout(Layout):
         n, width = len(seen.goal), spec.width_px
         bearing = np.arctan2(seen.goal[:, 1], seen.goal[:, 0])
         column = ((bearing + math.pi) / (2.0 * math.pi) * width).astype(np.int64)
+        # At the edges the bar keeps its width.
         column = np.clip(column, STRIP_HALF_WIDTH, width - 1 - STRIP_HALF_WIDTH)
         strip = np.full((n, 1, STRIP_ROWS, width), 255, np.uint8)
         strip[:, 0, -1] = 0
@@ -300,6 +304,7 @@ class PaperLayout(Layout):
         seen: Observation,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return velocity and goal in the world frame, and the goal's distance."""
+        # The goal's height is not part of the paper's observation.
         level = np.concatenate([seen.goal, np.zeros((len(seen.goal), 1))], axis=1)
         goal = heading_to_ned(level, seen.yaw)
         goal[:, 2] = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
@@ -328,12 +333,14 @@ class ScanLayout(Layout):
         """Return the scans (n, 1, frames, bearings with the seam)."""
         scans = scans_of(seen, spec.frames, spec.width_px, shrink.scanning)
         seam = self.seam(spec)
+        # An all-round scan has no edge: convolutions need the neighbours across the seam.
         columns = np.arange(-seam, spec.width_px + seam) % spec.width_px
         return scan_bytes(scans, spec.range_m)[:, None, :, columns]
 
     def newest(self, spec: ObservationSpec, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the newest scan without the seam, as high as the camera's image."""
         seam = self.seam(spec)
+        # One row is invisible beside the camera's image.
         return np.repeat(image[:1, :1, seam : seam + spec.width_px], spec.height_px, axis=1)
 
     @staticmethod
@@ -351,6 +358,7 @@ class CustomLayout(Layout):
     def boxes(self, spec: ObservationSpec) -> dict[str, Box]:
         """Return the arrays by key, sorted. Raises FieldError if a network cannot take them."""
         found = {key: Box(*box) for key, box in sorted(_custom(spec.layout).boxes(spec).items())}
+        # Only images have three axes; networks treat all others as vectors.
         images = {spec.kind, *spec.further_keys.values()}
         wrong = [
             f"{key} {np.dtype(box.dtype)} {box.shape}"
@@ -374,6 +382,7 @@ class CustomLayout(Layout):
         shrink: Shrink = NUMPY,  # noqa: ARG002 (for shipped layouts)
     ) -> Encoded:
         """Return the arrays of n vehicles. Raises UsageError if they differ from the boxes."""
+        # Checked on every call: custom code may return other shapes for other inputs.
         found, wanted = _custom(spec.layout).encode(spec, seen), self.boxes(spec)
         encoded = {key: np.asarray(found[key]) for key in wanted if key in found}
         n = len(seen.goal)
@@ -444,6 +453,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
 def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
     """Return a copy of one vehicle's newest frame, as a picture (h, w) or (h, w, 3)."""
     channels = layout_of(spec.layout).newest(spec, seen[spec.kind])
+    # Networks take channels first, pictures have them last.
     picture = np.moveaxis(channels, 0, -1)
     return np.array(picture if spec.kind == "rgb" else picture[..., 0], order="C")
 
@@ -461,6 +471,7 @@ def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
 def _below(seen: Observation) -> NDArray[np.float64]:
     """Return distances (n,) [m] of goals below their vehicles. Raises UsageError if unknown."""
     below = seen.goal_down
+    # A missing height must not become a goal at the vehicle's height.
     if below is None or not np.isfinite(below).all():
         raise UsageError("the network is told how high the goal is, and this goal has no height")
     return np.asarray(below, np.float64)
@@ -493,8 +504,10 @@ def _stack(
         return shrink.colour(image, rows, columns)
 
     newest = network(images[0])
+    # The common case copies no stack.
     if spec.frames == 1:
         return newest
+    # Missing depth frames are free space (no return), missing pictures are black.
     blank, channels = (255 if spec.kind == "depth" else 0), CHANNELS[spec.kind]
     stack = np.full((len(newest), channels * spec.frames, rows, columns), blank, np.uint8)
     for k, image in enumerate(images[: spec.frames]):

@@ -124,6 +124,7 @@ def _check(
     **rest: Any,
 ) -> PrearmCheck:
     """Return an arming requirement; `parameters` configure the check if given."""
+    # PX4 documents such checks by the parameters that configure them.
     if parameters:
         named = " and ".join(f"<param>{each}</param>" for each in parameters.split())
         description = f"Configured by {named}."
@@ -144,6 +145,7 @@ def _health(
     operator_text: str = "",
 ) -> PrearmCheck:
     """Return a check of hardware; `numbered`: the event has the number of the sensor, 0."""
+    # Single sensors here: their instance is always 0.
     extra = _INSTANCE if numbered else ()
     event = Definition(f"check_{name}", message, _ABOUT + extra, event_level, group="health")
     return PrearmCheck(event, component, fails, operator_text, values=(0,) * len(extra))
@@ -185,12 +187,14 @@ def _needed(
     An `estimate` fails in every mode, and blocks the modes that need it.
     """
     operator_text = f"Preflight Fail: No valid {estimate} estimate" if estimate else ""
+    # PX4 reports a missing estimate in every mode, but rejects only modes that need it.
     if estimate:
         rest["blocks"] = lambda r: _needs(r, need)
     return _check(
         component,
         f"modes_{name}",
         message,
+        # Other requirements are reported only in modes that have them.
         lambda r: fails(r.conditions) and (bool(estimate) or _needs(r, need)),
         *event,
         operator_text=operator_text,
@@ -237,12 +241,14 @@ def _supply_checked(r: Readiness) -> bool:
 
 
 def _charge_required(r: Readiness) -> bool:
+    # A negative value disables the requirement; in flight only the warnings count.
     return not r.armed and r.settings.com_arm_bat_min >= 0.0
 
 
 def _battery_level(r: Readiness) -> BatteryWarning:
     """Return the warning; a charge below COM_ARM_BAT_MIN is at least LOW."""
     warning = r.conditions.battery_warning
+    # COM_ARM_BAT_MIN may be above the warning threshold: the check must still have a text.
     return max(warning, BatteryWarning.LOW) if _charge_required(r) and r.charge_short else warning
 
 
@@ -377,6 +383,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _ESTIMATE,
         "estimator_missing_data",
         "Waiting for estimator to initialize",
+        # In flight, failsafes handle a lost estimate.
         lambda r: not r.converged and not r.armed,
         _L.INFO,
         operator_text="Preflight Fail: ekf2 missing data",
@@ -386,6 +393,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _ESTIMATE,
         "estimator_heading_not_stable",
         "Heading estimate not stable",
+        # The check concerns arming only.
         lambda r: not r.compass_agrees and not r.armed,
         operator_text="Preflight Fail: heading estimate not stable",
     ),
@@ -410,6 +418,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _SYSTEM,
         "failure_detector_pitch",
         "Attitude failure detected",
+        # PX4 reports one attitude failure at a time, roll first.
         lambda r: r.pitched and not r.rolled,
         _L.CRITICAL,
         "Pitch exceeds <param>FD_FAIL_P</param>.",
@@ -517,6 +526,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "global_pos",
         "Navigation error: No valid global position estimate",
         Need.GLOBAL_POSITION,
+        # Without a local position, that check explains the failure already.
         lambda c: c.global_position_invalid and not c.local_position_invalid,
         _L.ERROR,
         _NOT_ENOUGH,
@@ -577,6 +587,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
 @lru_cache(maxsize=256)
 def failing(readiness: Readiness) -> tuple[PrearmCheck, ...]:
     """Return the failing checks."""
+    # Cached: the commander asks several times per second, and readiness rarely changes.
     return tuple(check for check in CHECKS if check.fails(readiness))
 
 

@@ -158,6 +158,7 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
     words = Fault.model_validate(fault).model_copy(update={"phase": phase, "at_s": AFTER_S})
     setup = EpisodeSetup(vehicle, None, seed, Aircraft(faults=(words,), plant="kernel"))
     autopilot = builtin_autopilot(setup)
+    # A vehicle without GPS knows its origin only from the user.
     if (origin := vehicle.told_origin) is not None:
         autopilot.set_origin(origin)
     simulation = Simulation(
@@ -192,6 +193,7 @@ class _Flight:
 
     def _hear(self, text: str) -> None:
         faults = self.simulation.faults
+        # Texts before the fault belong to every flight.
         if faults is not None and faults.acted(self.simulation.time_us):
             self.texts.append(text)
 
@@ -201,6 +203,7 @@ class _Flight:
         while end is None and simulation.time_us < LONGEST_S * US_PER_S:
             try:
                 end = next(pilot, None) or self._tick()
+            # A numerical failure of the flight controller is a result, not an error of the study.
             except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
                 self.texts.append(f"{type(error).__name__}: {error}")
                 end = "broken"
@@ -212,11 +215,14 @@ class _Flight:
     def _tick(self) -> End | None:
         """Fly a tick; return the end if the flight is over, otherwise None."""
         simulation, flight = self.simulation, self.autopilot.flight
+        # 20 Hz, as MAVSDK repeats setpoints.
         if self.streams and simulation.time_us % _REPEAT_US < TICK_US:
             self._offer()
+        # Read before the tick: a hard touchdown may be detected as landed within it.
         flown = flight.phase is Commander.AIR
         simulation.tick()
         self.ticks += 1
+        # Checked rarely, to save time: non-finite values do not disappear again.
         if self.ticks % _LOOK_TICKS == 0 and not (
             np.isfinite(simulation.plant.motion).all()
             and np.isfinite(self.autopilot.estimator.state).all()
@@ -224,10 +230,13 @@ class _Flight:
             return "broken"
         distance_m = math.dist((0.0, 0.0, 0.0), simulation.plant.position)
         self.farthest_m = max(self.farthest_m, distance_m)
+        # Nothing brings such a vehicle back within the time limit.
         if distance_m > FENCE_M:
             return "flown away"
         for hit in simulation.plant.collisions:  # collisions of this tick only: nothing is recorded
             self.touchdowns.append(hit.speed_m_s)
+            # Harder contacts of a vehicle in the air are crashes; on the ground a tipped rotor
+            # touches, too.
             if hit.speed_m_s >= TOUCHDOWN_M_S and flown:
                 return "crashed"
         return None
@@ -256,11 +265,13 @@ class _Flight:
     def _pilot(self) -> Iterator[End | None]:
         """Act as the pilot, one tick per step; yield the end when it is known."""
         autopilot = self.autopilot
+        # A fault on the ground may prevent the estimator's start.
         while autopilot.flight.phase is Commander.BOOT:
             if self.simulation.time_us > 20 * US_PER_S:
                 yield "not armed"
             yield None
         yield from self._wait(2.0)
+        # Checks such as a stable heading need some seconds: a pilot tries again.
         for _ in range(5):
             if autopilot.arm(force=False) is Result.ACCEPTED:
                 break
@@ -271,6 +282,7 @@ class _Flight:
         yield from self._fly_as(Mode.TAKEOFF, 30.0, until=Mode.HOLD)
         yield from self._fly_as(Mode.HOLD, 2.0)
         north = Mode.MISSION if self.phase == "mission" else Mode.OFFBOARD
+        # After a failsafe the flight controller keeps the vehicle.
         if autopilot.flight.mode is Mode.HOLD:
             if north is Mode.MISSION:
                 autopilot.plans.store(MissionType.MISSION, (self._waypoint(),), 1, 0)
@@ -284,6 +296,7 @@ class _Flight:
         if autopilot.flight.mode is north:
             autopilot.set_mode(Mode.LAND)
         else:
+            # A failsafe has taken over: the pilot watches, then commands a landing.
             yield from self._until_down(OPERATOR_S)
             autopilot.set_mode(Mode.LAND)
         yield from self._until_down(LONGEST_S)
@@ -306,6 +319,7 @@ class _Flight:
         end_us = self.simulation.time_us + limit_s * US_PER_S
         while self.simulation.time_us < end_us:
             if self.autopilot.flight.phase < Commander.GROUND:
+                # Motors off above the ground: the vehicle falls.
                 yield "landed" if self.simulation.plant.position[2] > -0.5 else "crashed"
             yield None
 

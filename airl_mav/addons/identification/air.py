@@ -150,6 +150,8 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
     known = vehicle.drag.linear_n_s_m / mass_kg
     bias_m_s2 = vehicle.sensors.imu.accel_bias_m_s2
     source = "accelerometer, velocity and attitude in the vehicle's log"
+    # The accelerometer is preferred: it measures drag directly, without the derivative of a
+    # velocity.
     rows = _felt_rows(flown, bias_m_s2)
     if rows is None:
         source = f"lean and acceleration in {flown.told_by}"
@@ -157,9 +159,11 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
     if rows is None:
         return _nothing("the flight is too short", known, quadratic_1_m)
     middle, covariance = _posterior(rows, quadratic_1_m)
+    # Wind is a ratio of two normal variables, without a closed form of its quantiles.
     drawn = rng.multivariate_normal(middle[:_AIR], covariance[:_AIR, :_AIR], DRAWS)
     drag = _estimate(replace(DRAG, profile=known), middle[_DRAG], drawn[:, _DRAG], source)
     half = drag.half_width or 0.0
+    # An uncertain drag makes the wind meaningless: it is divided by the drag.
     if middle[_DRAG] <= 0.0 or half > WIDEST_DRAG * middle[_DRAG]:
         why = (
             f"drag {middle[_DRAG]:.3f} +- {half:.3f} 1/s: too little of the flight is fast, or the"
@@ -204,11 +208,14 @@ def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
         return None
     velocity = log.motion.at(felt.time_us)[:, 3:]
     axes = _rotation(log.attitude.at(felt.time_us)).transpose(0, 2, 1)[:, :2]
+    # Drag is proportional to the velocity in body axes.
     braked = -np.einsum("nij,nj->ni", axes, velocity)
     biases = [np.broadcast_to(each, braked.shape) for each in np.eye(2)]
+    # Pitch rate acts forward, roll rate to the left.
     by_rate = log.raw_rates.at(felt.time_us)[:, [1, 0]] * np.array([1.0, -1.0])
     matrix = np.stack([braked, axes[:, :, 0], axes[:, :, 1], *biases, by_rate], axis=2)
     learnt = _learnt_bias(log, flown.logged_us(flown.navigation_us) + SETTLE_US, end_us)
+    # Without a learnt bias the whole bias of the profile remains possible.
     sigma_m_s2 = bias_m_s2 if learnt is None else LEARNT_SHARE * bias_m_s2
     across = felt.values[:, :2] - (0.0 if learnt is None else learnt[:2])
     prior = (sigma_m_s2, sigma_m_s2, BY_RATE_M_S)
@@ -238,15 +245,18 @@ def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
         return None
     turn = _rotation(path.quaternion)
     time_s = (path.time_us - path.time_us[:1]) / US_PER_S
+    # Horizontal thrust as a share of vertical thrust.
     lean = turn[:, :2, 2] / turn[:, 2:, 2]
     sinking = path.velocity[:, 2:]
     carried = (GRAVITY_M_S2 - _rate(sinking, time_s)) * lean
     braked = sinking * lean - path.velocity[:, :2]
+    # Two biases: the estimator's error shrinks during the first seconds.
     early = (path.time_us < flown.navigation_us + SETTLE_US)[:, None]
     biases = [turn[:, :2, axis] * when for when in (early, ~early) for axis in (0, 1)]
     length_s = time_s[WINDOW:] - time_s[:-WINDOW]
 
     def mean(values: Array) -> Array:
+        # Trapezoidal rule, as telemetry is not evenly spaced.
         steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time_s)[:, None]
         sums = np.vstack([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
         return np.asarray((sums[WINDOW:] - sums[:-WINDOW]) / length_s[:, None])
@@ -268,15 +278,18 @@ def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
 
 def _posterior(rows: _Rows, quadratic_1_m: float) -> tuple[Array, Array]:
     """Return mean and covariance of the parameters; rows count by their autocorrelation time."""
+    # No prior for drag and wind: the flight alone determines them.
     held = np.concatenate([[np.inf] * _AIR, rows.prior])
     matrix = rows.matrix.reshape(-1, len(held))
     middle: Array = np.zeros(len(held))
     covariance: Array = np.eye(len(held))
     noise = 1.0
+    # Noise and quadratic drag depend on the fit, which depends on them: a few rounds settle both.
     for step in range(ITERATIONS):
         left = rows.left - _quadratic(rows, middle, quadratic_1_m)
         if step:
             error = left - rows.matrix @ middle
+            # Correlated rows carry less information than their number.
             slow = max(1.0, *(integrated_time(each) for each in error.T))
             noise = UNSEEN * float(np.mean(error**2)) * slow + middle[_DRAG] ** 2 * rows.off
         precision = np.diag(held**-2.0) + matrix.T @ matrix / noise
@@ -287,6 +300,7 @@ def _posterior(rows: _Rows, quadratic_1_m: float) -> tuple[Array, Array]:
 
 def _quadratic(rows: _Rows, middle: Array, quadratic_1_m: float) -> Array:
     """Return the effect of quadratic drag on the rows (n, 2) in the current wind [m/s²]."""
+    # Without drag the wind is undefined.
     if quadratic_1_m == 0.0 or middle[_DRAG] <= 0.0:
         return np.zeros_like(rows.left)
     wind = np.array([*middle[_NORTH : _EAST + 1] / middle[_DRAG], 0.0])
@@ -346,6 +360,7 @@ def thrust_of(found: FittedQuantity, vehicle: VehicleProfile, known: Known) -> T
         why = found.unobservable
         return Thrust(hover.without(why), found, mass.without(why), rotor.without(why))
     ends = np.array([found.value, found.low, found.high])
+    # Inverse quantities: the upper end of the ratio is their lower end.
     low_last = ends[[0, 2, 1]]
     hover = hover.found(GRAVITY_M_S2 / low_last, found.source)
     only = "only thrust per mass is observable; the {} is taken from the profile"
@@ -364,6 +379,7 @@ def _ratio(
         return blank.without("a black box holds no motor outputs: give the vehicle's log")
     start_us, end_us = (flown.logged_us(each) for each in flown.airborne_us)
     motors = log.motors.between(start_us, end_us)
+    # Corrected by the estimator's bias if logged.
     force = log.specific_force if len(log.specific_force) else log.raw_specific_force
     felt = force.between(start_us, end_us)
     if min(len(motors), len(felt)) < LEAST_SAMPLES:
@@ -376,6 +392,7 @@ def _ratio(
     # Error of the ratio, linearised: the error of the mean residual.
     left = carried - value * shared
     low, high = mean_interval(left, felt.time_us / US_PER_S, rng)
+    # Independent of the sampling error, so both add as squares.
     bias_m_s2 = QUANTILE * SETTLED_SHARE * vehicle.sensors.imu.accel_bias_m_s2
     low, high = -math.hypot(low, bias_m_s2), math.hypot(high, bias_m_s2)
     low, high = (value + end / float(shared.mean()) for end in (low, high))

@@ -140,21 +140,26 @@ def rehearse_flight(
     box = read_black_box(path)
     episode, info = episode_of(box), info_of(box)
     quality = episode.record.quality
+    # Without decisions there is no latency to replay and no path to compare.
     if quality is None or not len(episode.latency["sent_us"]):
         raise UsageError(f"{path}: no decision was recorded; accepted: a flight that navigated")
+    # An older result would be mixed with this one: run folders resume.
     if out.exists() and any(out.iterdir()):
         raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
     out.mkdir(parents=True, exist_ok=True)
     _write_latencies(episode, out / LATENCIES_FILE)
     wind, arena = changes.wind, asked.arena
     if arena is None:
+        # The plain's frame is turned to the first heading: the wind turns with it.
         wind = None if wind is None else turned_wind(wind, -_first_yaw(episode))
         episode = from_its_start(episode)
         arena = _plain(episode, out / ARENA_FILE)
     flew = str(box.run["config"].get("policy"))
+    # The recording names the policy, so its author would choose the code that runs here.
     if asked.policy is None and names_code(flew) and not asked.trust:
         accepted = "with --trust, or a --policy of yours: it is code that would run on this machine"
         raise FieldError("policy", flew, accepted)
+    # The flight's seed draws the same arena as in the flight.
     seed = episode.record.seed if asked.arena_seed is None else asked.arena_seed
     given = {
         "arena": arena,
@@ -168,6 +173,7 @@ def rehearse_flight(
     record = replace(
         episode.record, arena=scenario.arena, arena_seed=scenario.arena_seed_of(scenario.seed)
     )
+    # Saved before the rehearsals: an interrupted command leaves the flight readable.
     RunFolder.adopt(out / FLOWN, info).save_episodes([replace(episode, record=record)])
     run = rehearse(scenario, out=out / REHEARSED, progress=asked.progress)
     flown = _navigated(episode.trajectory, record)
@@ -183,6 +189,7 @@ def rehearse_flight(
         quality.flight_time_s,
         len(run.episodes),
         tuple(each.flight_time_s for each in successful(run.episodes)),
+        # Nearest of all rehearsals: discrete decisions choose different sides of an obstacle.
         np.min(paths, axis=0),
         tuple(float(np.median(each)) for each in paths),
     )
@@ -191,6 +198,7 @@ def rehearse_flight(
 def from_its_start(episode: FlownEpisode) -> FlownEpisode:
     """Return a flight moved to start navigation at the origin, heading north; heights stay."""
     path, record = episode.trajectory, episode.record
+    # Heights stay: they are above the ground in both frames.
     origin = path.position[_begun(episode)] * (1.0, 1.0, 0.0)
     turn = Rotation.from_euler("z", -_first_yaw(episode))
     north, east, *down = record.goal
@@ -220,6 +228,7 @@ def _begun(episode: FlownEpisode) -> int:
     """Return the index of the newest sample at the start of navigation."""
     navigation_us = episode.record.navigation_us or 0
     before = int(np.searchsorted(episode.trajectory.time_us, navigation_us, side="right")) - 1
+    # A flight that begins with navigation has no earlier sample.
     return max(before, 0)
 
 
@@ -231,6 +240,7 @@ def _first_yaw(episode: FlownEpisode) -> float:
 def _changed(changes: Changes, wind: WindSettings | None) -> dict[str, Any]:
     """Return changes as fields of a scenario."""
     late: dict[str, Any] = {}
+    # The recorded latency must not be added to another one.
     if changes.prompt or changes.computer is not None:
         late = {"latency": None}
     named = {"latency": changes.latency, "computer": changes.computer, "vehicle": changes.vehicle}
@@ -259,6 +269,7 @@ def _write_latencies(episode: FlownEpisode, path: Path) -> None:
 
 def _plain(episode: FlownEpisode, path: Path) -> str:
     """Write the profile of an empty arena around a flight, and return its path."""
+    # Start and goal must be inside even if the flight ended early.
     here = np.vstack([episode.trajectory.position[:, :2], [0.0, 0.0], episode.record.goal[:2]])
     low, high = here.min(axis=0) - CLEAR_M, here.max(axis=0) + CLEAR_M
     (north, east), (start_north, start_east) = high - low, -low
@@ -266,6 +277,7 @@ def _plain(episode: FlownEpisode, path: Path) -> str:
     goal_up = goal_height_m(episode.record.goal)
     profile: dict[str, Any] = {
         "description": "an empty plain",
+        # One zone over the diagonal: a plain has no obstacles to grade.
         "zones_m": [float(max(np.hypot(north, east), 1.0))],
         "size": {"north_m": float(north), "east_m": float(east)},
         "start": {"north_m": float(start_north), "east_m": float(start_east)},
@@ -274,6 +286,7 @@ def _plain(episode: FlownEpisode, path: Path) -> str:
     }
     if goal_up is not None:
         profile["goal"] |= {"height_m": goal_up}
+        # The walls must reach the goal, or the profile is rejected.
         profile["size"] |= {"height_m": max(Size().height_m, goal_up)}
     try:
         ArenaSpec.model_validate(profile)
@@ -290,6 +303,7 @@ def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario
     """Return the scenario of a flight's rehearsals: the companion's settings, at level lockstep."""
     asked = box.run["config"]
     names = (*Decisions.model_fields, "vehicle", "policy", "seed")
+    # Recordings of other programs may lack settings: defaults apply.
     kept = {name: asked[name] for name in names if name in asked}
     how = {
         "level": "lockstep",
@@ -302,6 +316,7 @@ def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario
 
 def _check_goal(scenario: Scenario, episode: FlownEpisode) -> None:
     resolved = resolve(scenario)
+    # Paths in different frames have no meaningful distance.
     goal = resolved.arena_of(scenario.seed).goal
     flown = episode.record.goal
     if math.hypot(goal[0] - flown[0], goal[1] - flown[1]) > SAME_GOAL_M:
@@ -369,6 +384,7 @@ def rehearse_flight_parts(
     up. `out` gets `parts` beside the folders of `rehearse_flight`.
     """
     everything, base = changes_of(folder), _read(folder).vehicle
+    # Baseline: the profile before the identification, calm air, no injected latency.
     nothing = Changes(vehicle=base, prompt=True)
     parts = {
         NOTHING: nothing,
@@ -377,6 +393,7 @@ def rehearse_flight_parts(
         WIND: replace(nothing, wind=everything.wind),
     }
 
+    # All values first: an error in its settings shows before the parts are flown.
     whole = rehearse_flight(path, out, asked, everything)
     found = [
         _figures(part, rehearse_flight(path, out / PARTS_FOLDER / part, asked, changes))
@@ -411,6 +428,7 @@ def _figures(part: str, flown: Reflight) -> PartFlown:
         rehearsals=flown.rehearsals,
         reached=len(flown.rehearsed_s),
         time_s=time_s,
+        # Relative, so that parts of short and long flights compare.
         time_share=None if time_s is None else (time_s - flown.flown_s) / flown.flown_s,
         apart_m=float(np.median(flown.each_apart_m)),
     )

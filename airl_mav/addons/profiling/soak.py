@@ -67,9 +67,11 @@ class Soak:
     def ends(self, name: str) -> tuple[float, float] | None:
         """Return the mean of a column over the first and the last part; None: not available."""
         column, time_s = self.series[name], self.series["time_s"]
+        # A row longer than the window is the first part alone.
         first, last = max(self.window_s, time_s[0]), self.duration_s - self.window_s
         parts = time_s <= first, time_s > last
         known = [column[part & np.isfinite(column)] for part in parts]
+        # A change needs a reading at both ends.
         if not all(part.size for part in known):
             return None
         return float(known[0].mean()), float(known[1].mean())
@@ -144,6 +146,7 @@ def soak(
     first: list[tuple[int, Samples]] = []
     last: deque[tuple[int, Samples]] = deque()
     now_us = begun_us
+    # At least one row: an immediate interrupt still has a result.
     while now_us < end_us and not (rows and stop()):
         row_end_us = min(now_us + ROW_US, end_us)
         taken: list[int] = []
@@ -152,6 +155,7 @@ def soak(
             taken.append(now_us - started_us)
         samples = np.array(taken, np.int64)
         since_us = now_us - begun_us
+        # Only both ends are kept: an hour of decisions would fill the memory of a small computer.
         if since_us <= WINDOW_US or not first:
             first.append((since_us, samples))
         last.append((since_us, samples))
@@ -164,6 +168,7 @@ def soak(
         now_us = clock.time_us()
     names = ("time_s", "n", "p50_ms", "max_ms", *MachineReading._fields)
     lasted_us = last[-1][0]
+    # In a short soak the first and the last part must not overlap.
     window_us = min(WINDOW_US, lasted_us // 2)
     early = [part for end, part in first if end <= window_us] or [first[0][1]]
     late = [part for end, part in last if end > lasted_us - window_us]
@@ -260,6 +265,7 @@ def soak_figure(soaked: Soak, name: str) -> FigureImage:
     minutes = series["time_s"] / 60.0
     axes[0].fill_between(minutes, series["p50_ms"], series["max_ms"], color=theme.SERIES_SOFT, lw=0)
     axes[0].plot(minutes, series["p50_ms"], color=theme.SERIES, lw=1.0)
+    # A single outlier would flatten the median on a linear axis.
     if series["max_ms"].max() > LONG_TAIL * np.median(series["p50_ms"]):
         theme.logarithmic(axes[0], "y")
     else:

@@ -62,8 +62,11 @@ class ObstacleMap:
     def take(self, obstacles: ObstacleBins, yaw: float) -> None:
         """Add reported obstacles at a heading [rad]."""
         self.time_us = max(self.time_us, obstacles.time_us)
+        # Several sensors share the map: the smallest minimum range applies.
         self.nearest_cm = min(self.nearest_cm, obstacles.nearest_cm)
+        # The map turns with the body.
         offset = obstacles.offset_deg - (math.degrees(yaw) if obstacles.in_world else 0.0)
+        # Coarse bins need fewer of them for a full turn.
         count = min(BINS, math.ceil(360.0 / obstacles.increment_deg))
         mine = _edges(BINS, BIN_DEG, 0.0)
         reported = _edges(count, obstacles.increment_deg, offset)
@@ -139,9 +142,11 @@ class CollisionPrevention:
         """
         self._active_us = now_us if self._active_us is None else self._active_us
         fresh = obstacles is not None and now_us - obstacles.time_us < STALE_US
+        # A report is entered once: entering it again would refresh its age.
         if obstacles is not None and obstacles is not self._taken and fresh:
             self._taken = obstacles
             self.map.take(obstacles, yaw)
+        # Discard after entering, so that a new report is not judged by its predecessor's age.
         self.map.forget(now_us)
         if not self.map.has_data(now_us):
             # Without data no direction is permitted.
@@ -149,6 +154,7 @@ class CollisionPrevention:
             self.gives_up = now_us - since_us > GIVE_UP_US
             return 0.0, 0.0
         length = math.hypot(*commanded)
+        # Released sticks have no direction; the position hold brakes.
         if length <= _DEFLECTED_M_S2:
             return commanded
         directions = yaw + np.radians(BIN_DEG * np.arange(BINS))
@@ -170,11 +176,13 @@ class CollisionPrevention:
         ahead = math.degrees(math.atan2(direction[1], direction[0]) - yaw) % 360.0
         requested = best = int(ahead // BIN_DEG)
         distances, keep_cm = self.map.distances_cm, 100.0 * self._value("CP_DIST")
+        # Unknown space is assumed to be as near as CP_DIST: neither attractive nor blocking.
         assumed = np.where(distances == UNKNOWN_CM, keep_cm, distances)
         least, most = math.inf, int(self._value("CP_GUIDE_ANG") // BIN_DEG)
         for aside in range(-most, most + 1):
             i = (requested + aside) % BINS
             mean = (assumed[i - 1] + assumed[i] + assumed[(i + 1) % BINS]) / 3.0
+            # Turning away from the stick costs half of CP_DIST per bin, so small gains are ignored.
             cost = 0.5 * keep_cm * abs(aside) - mean - distances[i]
             if cost < least and distances[i] != UNKNOWN_CM:
                 least, best = cost, i
@@ -191,11 +199,13 @@ class CollisionPrevention:
         closest = int(np.argmin(self.map.distances_cm))
         towards = bins[closest]
         share = float(direction @ towards)
+        # Motion away from the closest obstacle is free.
         if share <= 0.0:
             return direction
         normal = share * towards
         tangential = direction - normal
         beside_m = 0.0
+        # Straight towards the obstacle there is no tangential direction.
         if np.linalg.norm(tangential) > 1e-6:
             angle = math.degrees(math.atan2(tangential[1], tangential[0]) - yaw) % 360.0
             beside_m = _M_PER_CM * self.map.distances_cm[round(angle / BIN_DEG) % BINS]
@@ -207,6 +217,7 @@ class CollisionPrevention:
         """Return the share of an acceleration towards an obstacle at a distance; negative: away."""
         keep_m = self._keep_m
         over_m = distance_m - keep_m
+        # Distance over which the position controller reaches full speed.
         reach_m = max(keep_m, self._value("MPC_VEL_MANUAL") / self._value("MPC_XY_P"))
         return min(1.0, (over_m / reach_m) ** 2 if over_m > 0.0 else over_m)
 
@@ -216,9 +227,11 @@ class CollisionPrevention:
         hardest, away = math.inf, np.zeros(2)
         for i in range(BINS):
             distance_cm = float(obstacles.distances_cm[i])
+            # Below the minimum range a distance is a sensor artefact.
             if not obstacles.nearest_cm < distance_cm < UNKNOWN_CM:
                 continue
             towards = max(0.0, float(velocity @ bins[i]))
+            # The vehicle flies on during the sensor's delay and the age of the reading.
             delayed_m = towards * value("CP_DELAY")
             if distance_cm < obstacles.ranges_cm[i]:
                 delayed_m += towards * (now_us - float(obstacles.seen_us[i])) / US_PER_S
@@ -227,6 +240,8 @@ class CollisionPrevention:
             if left_m >= 0.0:
                 most = braking_speed(left_m, value("MPC_ACC_HOR"), value("MPC_JERK_MAX"))
             brake = value("MPC_XY_VEL_P_ACC") * min(most - towards, 0.0)
+            # Only the most urgent direction brakes: a sum over neighbouring bins would count an
+            # obstacle several times.
             if brake < hardest:
                 hardest, away = brake, bins[i]
         braked: Vector = hardest * away if math.isfinite(hardest) else away

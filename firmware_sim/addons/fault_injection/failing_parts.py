@@ -42,6 +42,7 @@ def motor_effects(acting: Sequence[Acting]) -> tuple[dict[int, float], dict[int,
     for _, fault, *_ in acting:
         motor = MOTORS.index(fault.part)
         if fault.kind == "slow":
+            # Several faults of one motor multiply: each scales what the others leave.
             slow[motor] = slow.get(motor, 1.0) * fault.amount
         else:
             left[motor] = left.get(motor, 1.0) * _share(fault)
@@ -64,6 +65,7 @@ def weakened(
     """
     motors = list(controls.motors)
     for index, share in left.items():
+        # Thrust is proportional to the square of the speed, the command is not: convert both ways.
         thrust = min(1.0, share * steady_speed(motors[index], thrust_curve) ** 2)
         motors[index] = command_for(thrust, thrust_curve)
     first, second, third, fourth = motors
@@ -101,6 +103,7 @@ def misread(
         if fault.kind == "off":
             empty_v = battery.cells * battery.cell_empty_v
             reading = reading._replace(voltage_v=empty_v, remaining=0.0)
+        # A sag is per cell, so that one fault fits batteries of any cell count.
         elif fault.kind == "sag":
             voltage_v = max(0.0, reading.voltage_v - battery.cells * fault.amount)
             reading = reading._replace(voltage_v=voltage_v)
@@ -158,9 +161,12 @@ class Late:
         queue = self._queue
         if value is not None:
             queue.append((time_us + self._delay_us, value))
+            # Until the first delayed sample arrives, an inertial sensor repeats the first one: the
+            # flight controller requires a value in every tick.
             if self._newest is None:
                 self._newest = value
         arrived = None
+        # After a shortened delay several samples may be due: the newest wins.
         while queue and queue[0][0] <= time_us:
             arrived = self._newest = queue.popleft()[1]
         return self._newest if self._always else arrived
@@ -195,6 +201,8 @@ class Noisy:
         del time_us
         if value is None:
             return None
+        # One draw for position and velocity, so that the stream does not depend on the sample's
+        # type.
         error = self.sd * self.rng.standard_normal(len(self.sd))
         moved = shifted(value, error[:3])
         if isinstance(moved, interfaces.GpsFix):
@@ -213,6 +221,7 @@ def shifted(value: Any, offset: Vector) -> Any:
     if isinstance(value, interfaces.DistanceReading):
         return farther(value, offset.item(0))
     if isinstance(value, interfaces.FlowReading):
+        # Flow is an integrated angle: a rate error grows with the interval. Quality 0 has no flow.
         error = offset * value.interval_s if value.quality > 0 else 0.0
         return value._replace(flow=value.flow + error)
     if isinstance(value, float):
@@ -225,12 +234,14 @@ def farther(reading: interfaces.DistanceReading, error_m: float) -> interfaces.D
     if reading.quality == 0:
         return reading
     distance_m = max(0.0, reading.distance_m + error_m)
+    # Beyond its limits a range finder reports an invalid measurement, not a wrong distance.
     within = reading.least_m <= distance_m <= reading.greatest_m
     return reading._replace(distance_m=distance_m, quality=reading.quality if within else 0)
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
     """Return the sd of a sensor's noise; for a fix or a pose, position (3) and velocity (3)."""
+    # Profiles give noise per base tick; white noise of shorter ticks has a larger deviation.
     white = math.sqrt(TICK_S / tick_s)
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
@@ -256,6 +267,8 @@ def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Ge
     """Return the effect of a sensor fault; `rng` is used by this fault only."""
     fault = acting.fault
     part, kind = fault.part, fault.kind
+    # A missing inertial sample would stop the flight controller's loop: such a sensor repeats its
+    # last value instead.
     if kind == "off" and part not in INERTIAL:
         return _off
     if kind in ("off", "stuck"):
@@ -279,6 +292,7 @@ def failed(
     changed: dict[str, Any] = {}
     for part, effect in effects:
         name = FIELDS[part]
+        # A second fault of a sensor acts on the output of the first.
         value = changed[name] if name in changed else getattr(sample, name)
         changed[name] = effect(value, sample.time_us)
     return sample._replace(**changed)
@@ -351,6 +365,7 @@ class FailingParts:
 
     def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
         """Advance the flight controller by the altered sample; return effective motor commands."""
+        # Faults start before the sample is altered, so they act from this tick on.
         self._timeline.update(sample.time_us, self._controller.flight)
         if self._effects:
             sample = failed(sample, self._effects)
@@ -359,6 +374,7 @@ class FailingParts:
             sample = sample._replace(battery=reading)
         if self._wind:
             self._gusts.more = gust_at(self._wind, sample.time_us)
+        # ESC feedback must show the failing motors, otherwise motor failure could not be detected.
         if self._turning is not None:
             sample = sample._replace(esc_outputs=self._turning)
         controls = self._controller.step(sample)
@@ -379,18 +395,22 @@ class FailingParts:
         timeline, before = self._timeline, self._memories
         sensors = timeline.acting(*SENSORS)
         self._memories = {
-            each.number: before.get(each.number) or self._effect_of(each) for each in sensors
+            # Effects with a state (held samples, queues) continue when another fault changes.
+            each.number: before.get(each.number) or self._effect_of(each)
+            for each in sensors
         }
         self._effects = [(each.fault.part, self._memories[each.number]) for each in sensors]
         self._left, self._slow = motor_effects(timeline.acting(*MOTORS))
         battery = timeline.acting("battery")
         for each in battery:
+            # A drop removes charge once, however often the set of faults changes.
             if each.fault.kind == "drop" and each.number not in self._dropped:
                 self._dropped.add(each.number)
                 left = self._plant.battery_remaining - each.fault.amount
                 self._plant.battery_remaining = max(0.0, left)
         self._battery = [each for each in battery if each.fault.kind != "drop"]
         self._wind = timeline.acting("wind")
+        # The last gust must not remain after its fault has ended.
         if not self._wind:
             self._gusts.more = None
 
@@ -420,6 +440,7 @@ class FailingCamera:
 
     def restart(self, time_us: int) -> None:
         """Begin an episode at `time_us` [µs]."""
+        # Frames of the previous episode must not arrive in this one.
         self._late.clear()
         self._camera.restart(time_us)
 
@@ -443,6 +464,8 @@ class FailingCamera:
                 delay_us += round(each.fault.amount * US_PER_S)
             elif kind == "noise":
                 noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
+                # A separate stream per fault: a further fault must not change the noise of the
+                # others.
                 seed = NOISE_SEED * (each.number + 1) + self._seed
                 depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
                 frame = _showing(frame, depth, frame.jpeg)
@@ -459,6 +482,7 @@ class FailingCamera:
 
     def _rearrange(self) -> None:
         self._acting = self._timeline.acting("camera")
+        # The next stuck fault freezes a new frame.
         if all(each.fault.kind != "stuck" for each in self._acting):
             self._frozen = None
 

@@ -59,6 +59,7 @@ def landing_start(items: tuple[plan.PlanItem, ...]) -> int | None:
     if not landings:
         return None
     starts = [index for index, item in enumerate(items) if item.command == _N.DO_LAND_START]
+    # A DO_LAND_START behind the landing does not start it: the earlier of both is used.
     return min([*starts[:1], landings[0]])
 
 
@@ -79,6 +80,7 @@ def along_mission(
         return ()
     if landing_start(items) is not None:
         return onwards(plans, index)
+    # In flight the active item is not yet reached: the way back begins at the one before.
     return _back(items, index - 1 if flying else index, home)
 
 
@@ -86,9 +88,11 @@ def onwards(plans: plan.Plans, index: int) -> tuple[plan.PlanItem, ...]:
     """Return the places from an item to the landing, including remaining jumps."""
     remaining = plan.Plans()
     remaining.store(plan.MissionType.MISSION, plans.mission, 0)
+    # A copy: the preview of the path must not consume the mission's jumps.
     remaining.jumps_done = dict(plans.jumps_done)
     way: list[plan.PlanItem] = []
     following = go_to(remaining, index)
+    # Jumps may form a loop, so the length is limited.
     for _ in range(MOST_ITEMS):
         if following is None:
             break
@@ -125,8 +129,10 @@ def _back(
 def _passed(item: plan.PlanItem) -> plan.PlanItem:
     """Return an item as a waypoint without a stay; LOITER_TO_ALT is unchanged."""
     _, radius, passing, heading = item.params
+    # Its altitude change is part of the path and must not be skipped.
     if item.command == _N.LOITER_TO_ALT:
         return replace(item, autocontinue=True)
+    # Parameter 2 is an acceptance radius only for waypoints; 0 selects the default.
     own = radius if item.command == _N.WAYPOINT else 0.0
     return replace(
         item, command=_N.WAYPOINT, params=(0.0, own, passing, heading), autocontinue=True
@@ -190,6 +196,7 @@ def destination(
         return plan.distance_m(place[:2], here[:2])
 
     best = Destination(home)
+    # Any other place is nearer than infinity, so home is used only without one.
     nearest = math.inf if kind == ReturnType.NOT_HOME else away(home)
     candidates: list[Destination] = []
     if kind in (ReturnType.NOT_HOME, ReturnType.NEAREST) and valid:
@@ -201,8 +208,10 @@ def destination(
         for item in plans.stored(plan.MissionType.RALLY).items
         if item.command == NavCommand.RALLY_POINT
     ]
+    # A rally point at home is no alternative to home.
     far = [place for place in rally if plan.distance_m(place[:2], home[:2]) > OF_HOME_M]
     for candidate in [*candidates, *map(Destination, far)]:
+        # The margin prevents a change of destination by noise.
         if away(candidate.place) + NEARER_M < nearest:
             best, nearest = candidate, away(candidate.place)
     return best
@@ -264,6 +273,7 @@ class MissionManager(plan.Missions):
     def step(self, now: plan.NavigationState, mode: Mode, /, *, armed: bool) -> None:
         """Advance by a period of the navigator."""
         flying = armed and mode is Mode.MISSION
+        # Return goes first: it needs to know whether the mission was active until now.
         self._step_home(now, returning=armed and mode is Mode.RETURN)
         if flying and not self._flying:
             self.executor.activate(now)
@@ -294,6 +304,7 @@ class MissionManager(plan.Missions):
     @property
     def _return_type(self) -> ReturnType:
         number = round(self._value("RTL_TYPE"))
+        # Parameters accept any number: undefined ones count as 0.
         return ReturnType(number) if number in set(ReturnType) else ReturnType.HOME_OR_RALLY
 
     def _goal(self, now: plan.NavigationState) -> Destination:
@@ -309,6 +320,7 @@ class MissionManager(plan.Missions):
             way = along_mission(self._plans, now.home, here, flying=flying)
         else:
             way = ()
+        # Stored as a mission of its own: the uploaded mission keeps its active item.
         self._way_home.store(plan.MissionType.MISSION, way, 0, 0)
 
     def _way_to_landing(
@@ -323,9 +335,11 @@ class MissionManager(plan.Missions):
         above = return_height(self._value, here.altitude_m - ground.altitude_m, away)
         landing = onwards(self._plans, begin)
         altitude = ground.altitude_m + above
+        # Above the return altitude already: no climb.
         if altitude <= here.altitude_m:
             return landing
         text = f"RTL Mission land: climb to {math.ceil(altitude)} m"
+        # Rounded up, as the operator compares the text with a minimum altitude.
         event = RTL_MISSION_LAND.event(math.ceil(altitude))
         self._crew.say(OperatorText(Severity.INFO, text, event))
         return (at(_N.WAYPOINT, here, altitude), *landing)
@@ -388,13 +402,17 @@ class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
             # The trajectory starts at the vehicle's position at lift-off.
             return leave_ground(context, state, time_us)
         if triplet is not self._triplet:
+            # A speed that the operator changed since then is kept while the mission's speed is
+            # unchanged.
             if self._triplet is None or triplet.cruise_m_s != self._triplet.cruise_m_s:
                 travel.speed_m_s = triplet.cruise_m_s
             self._triplet = triplet
+            # Reported once per triplet; the landing continues without the target.
             if triplet.precision and self._precision is None:
                 text = "Precision landing is not available without the add-on extra_modes"
                 context.say(OperatorText(Severity.CRITICAL, text))
         if triplet.precision and self._precision is not None:
+            # The search starts once, at the current height above the item's place.
             if not self._lands_precisely:
                 self._lands_precisely = True
                 north, east, down = *triplet.target[:2], position[2]
@@ -409,6 +427,7 @@ class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
         if triplet.kind is _LAND:
             speed = landing_speed(context.value, context.height(state), context.ground_m)
             north, east, _ = triplet.target
+            # The ground's height is unknown: descend at a speed until the land detector acts.
             leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
         return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
 
@@ -431,6 +450,7 @@ class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
             return math.nan
         position = triple(state, P)
         north, east = home[0] - position[0], home[1] - position[1]
+        # Near home the direction to it is undefined.
         if math.hypot(north, east) < self._path.acceptance_m:
             return math.nan
         return math.atan2(east, north) if mode == 1 else math.atan2(-east, -north)
@@ -447,12 +467,15 @@ def _leg(triplet: Triplet, position: Vec) -> PathSegment:
         return direct
     line = [b - a for a, b in zip(start, target, strict=True)]
     length = math.hypot(*line)
+    # Waypoints at the same place have no line.
     if length < 1e-6:
         return direct
     unit = [c / length for c in line]
     along = math.fsum(u * (p - s) for u, p, s in zip(unit, position, start, strict=True))
+    # Past the waypoint: fly back to it directly, not along the extended line.
     if along > length:
         return PathSegment(target, position, triplet.next)
+    # Before the start of the line: fly to the start first.
     if along < 0.0 and math.dist(start, position) > triplet.acceptance_m:
         return PathSegment(start, position, target)
     north, east, down = (s + u * along for s, u in zip(start, unit, strict=True))

@@ -75,6 +75,8 @@ class YawStick:
         value = self._value
         shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_YAW_EXPO"))
         target = shaped * value("MPC_MAN_Y_MAX") * DEG
+        # First-order filter of time constant MPC_MAN_Y_TAU: a jump of the stick must not become a
+        # jump of the yaw rate.
         self._rate += (target - self._rate) * dt / (dt + value("MPC_MAN_Y_TAU"))
         if abs(self._rate) > _TURNS_RAD_S:
             self._held = interface.NAN
@@ -101,7 +103,10 @@ class VerticalStick:
         value, axis = self._value, self._axis
         shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_Z_MAN_EXPO"))
         target = self._speed(shaped, height)
+        # Advance the previous plan first: the stick's new target is planned from there.
         axis.advance(dt)
+        # The height is held only after the trajectory has stopped, otherwise the vehicle would jump
+        # back to the place where the stick was released.
         resting = abs(axis.velocity) < _AT_REST_M_S and abs(axis.acceleration) < _AT_REST_M_S2
         if resting and target == 0.0:
             if math.isnan(self._held):
@@ -109,6 +114,7 @@ class VerticalStick:
         else:
             self._held = interface.NAN
             axis.position = down
+        # NED: a negative target is a climb.
         limit = value("MPC_ACC_UP_MAX") if target < 0.0 else value("MPC_ACC_DOWN_MAX")
         axis.plan(target, limit, value("MPC_JERK_MAX"))
         return AxisDemand(self._held, axis.velocity, axis.acceleration)
@@ -124,6 +130,7 @@ class VerticalStick:
         """Return the speed NED [m/s], reduced near the ground."""
         value = self._value
         low, high = value("MPC_LAND_ALT2"), max(value("MPC_LAND_ALT1"), value("MPC_LAND_ALT2"))
+        # Between both heights the limits change linearly, as in a landing.
         share = 1.0 if height >= high else 0.0
         if low < height < high:
             share = (height - low) / (high - low)
@@ -162,17 +169,21 @@ class HorizontalStick:
         `constrain` returns the permitted acceleration at a velocity setpoint.
         """
         value = self._value
+        # Twice the acceleration at full stick: at the maximum speed drag cancels it.
         speed, force = value("MPC_VEL_MANUAL"), 2.0 * value("MPC_ACC_HOR")
         north, east = self._direction(sticks, yaw)
         released = north == 0.0 and east == 0.0
+        # Released sticks brake harder than drag alone, which would fade with the speed.
         boost = max(2.0, math.sqrt(speed)) if released else 1.0
         self._boost += (boost - self._boost) * dt / (dt + _BOOST_TAU_S)
         drag = [force / speed * self._boost * v for v in self._dragged()]
         target = north * force, east * force
         if constrain is not None:
             target = constrain(target, self._velocity)
+            # A fully blocked direction counts as released: the vehicle must brake, not coast.
             released = target == (0.0, 0.0)
         before = self._acceleration
+        # Drag may stop the vehicle within a tick, but must not reverse its motion.
         reversing = any(w * b < 0.0 for w, b in zip(target, before, strict=True))
         if (released or reversing) and math.hypot(*self._velocity) < math.hypot(*drag) * dt:
             drag, self._velocity = [0.0, 0.0], (0.0, 0.0)
@@ -194,9 +205,11 @@ class HorizontalStick:
         value = self._value
         zone, share = value("MPC_HOLD_DZ"), value("MPC_XY_MAN_EXPO")
         forward, right = (expo(deadzone(s, zone), share) for s in sticks)
+        # Diagonal stick travel must not exceed the speed of a single axis.
         length = max(1.0, math.hypot(forward, right))
         forward, right = forward / length, right / length
         side, back = value("MPC_VEL_MAN_SIDE"), value("MPC_VEL_MAN_BACK")
+        # Negative values disable the separate limits for sideways and backward flight.
         if side >= 0.0:
             right *= side / value("MPC_VEL_MANUAL")
         if back >= 0.0 and forward < 0.0:
@@ -210,6 +223,7 @@ class HorizontalStick:
         speed = math.hypot(vn, ve)
         if speed == 0.0:
             return 0.0, 0.0
+        # Linear drag alone never stops: below 1 m/s its share of the speed is raised.
         braking = min(1.0, max(0.0, self._boost - 1.0))
         share = braking * max(1.0, 1.0 / math.sqrt(speed)) + 1.0 - braking
         return vn * share, ve * share
@@ -222,6 +236,7 @@ class HorizontalStick:
         share = 1.0 if step <= most else most / step
         north, east = bn + dn * share, be + de * share
         length = math.hypot(north, east)
+        # The thrust vector's tilt limits the horizontal acceleration at constant height.
         tilt = math.tan(value("MPC_TILTMAX_AIR") * DEG) * GRAVITY_M_S2
         share = 1.0 if length <= tilt else tilt / length
         return north * share, east * share
@@ -272,6 +287,7 @@ class TerrainHold:
         if int(self._value("MPC_ALT_MODE")) != HOLD_TERRAIN:
             self.restart()
             return held
+        # A reset shifts the height above ground: the held height is no longer valid.
         if now.resets != self._resets:
             self._resets, self.locked_m = now.resets, interface.NAN
         is_known, limit = math.isfinite(now.ground_m), self._value("MPC_HOLD_MAX_XY")
@@ -279,12 +295,14 @@ class TerrainHold:
         if self.holds:
             if deflected or now.speed_m_s > limit or not is_known:
                 self.holds = False
+        # Half the limit as hysteresis: noise at the limit must not toggle the hold.
         elif not deflected and now.speed_m_s < 0.5 * limit and is_known:
             self.holds = True
             if math.isfinite(held):
                 # Keep the height error.
                 self.locked_m = now.ground_m - (held - now.down_m)
         if not self.holds:
+            # While the altitude is not held either, the next hold locks a new height.
             if not now.climbing and math.isnan(held):
                 self.locked_m = interface.NAN
             return held
@@ -292,6 +310,7 @@ class TerrainHold:
 
     def _follow(self, now: Piloting) -> float:
         slow = self._value("MPC_HOLD_MAX_Z")
+        # A vehicle that still climbs would be pulled back to the height of the release.
         stopped = slow <= 0.0 or abs(now.climb_m_s) < slow
         if now.climbing:
             self.locked_m = interface.NAN
@@ -336,6 +355,7 @@ class Piloted(interface.FlightMode):
         sticks = self._context.sticks
         dt, self._time_us = interface.since(self._time_us, time_us), time_us
         if sticks is None:
+            # Keep the heading of the last stick input: `_restart` replaces it.
             yaw = self._yaw
             self._restart(state)
             self._yaw = yaw
@@ -373,6 +393,7 @@ class Piloted(interface.FlightMode):
             resets=0 if ground is None else ground.resets,
         )
         place = hold.place(now, z.position)
+        # The altitude hold continues at the current height, without the terrain's error.
         if before and not hold.holds:
             place = self._vertical.put(down)
         return z._replace(position=place)
@@ -390,6 +411,7 @@ class Altitude(Piloted, modes=(Mode.ALTITUDE,)):
     def _steer(
         self, sticks: interface.Sticks, heading: float, _state: Vector, _dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
+        # The tangent grows without bound at 90 degrees.
         tilt = min(89.0, self._context.value("MPC_MAN_TILT_MAX")) * DEG
         most = min(3.0, max(0.02, math.tan(tilt))) * GRAVITY_M_S2
         length = max(1.0, math.hypot(sticks.pitch, sticks.roll))
@@ -414,6 +436,7 @@ class Position(Piloted, modes=(Mode.POSITION,)):
     def enter(self, state: Vector, request: interface.ModeRequest | None, /) -> None:
         """Start with the current motion."""
         super().enter(state, request)
+        # A pilot who relies on CP_DIST must know that it is not active.
         if not self.prevents_collisions and self._context.value("CP_DIST") > 0.0:
             text = "CP_DIST has no effect without the add-on extra_modes"
             self._context.say(OperatorText(Severity.CRITICAL, text))
@@ -466,6 +489,7 @@ class Stabilized(interface.FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
         value, sticks = self._context.value, self._context.sticks or RELEASED
         dt, self._time_us = interface.since(self._time_us, time_us), time_us
         rate = sticks.yaw * value("MPC_MAN_Y_MAX") * DEG
+        # On the ground the heading follows the vehicle: a stored heading would turn it at take-off.
         if sticks.throttle < IDLE_THROTTLE:
             self._yaw = quat_yaw(state[Q:RATES])
         else:
@@ -473,10 +497,12 @@ class Stabilized(interface.FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
         most = value("MPC_MAN_TILT_MAX") * DEG
         roll, pitch = sticks.roll * most, -sticks.pitch * most
         tilt = math.hypot(roll, pitch)
+        # Both sticks at full travel must not exceed the tilt of one.
         share = 1.0 if tilt <= most else most / tilt
         half = 0.5 * tilt * share
         scale = math.sin(half) / tilt if tilt > 0.0 else 0.0
         leaning = (math.cos(half), roll * scale, pitch * scale, 0.0)
+        # Heading first, then the lean in the heading's frame: sticks are relative to the nose.
         heading = (math.cos(self._yaw / 2.0), 0.0, 0.0, math.sin(self._yaw / 2.0))
         return AttitudeDemand(multiply(heading, leaning), rate, thrust_of(sticks.throttle, value))
 
@@ -484,6 +510,7 @@ class Stabilized(interface.FlightMode, modes=(Mode.MANUAL, Mode.STABILIZED)):
 def thrust_of(throttle: float, value: Callable[[str], float]) -> float:
     """Return the collective 0..1 of a throttle stick -1..1; centre = hover (MPC_THR_CURVE)."""
     low, high = value("MPC_MANTHR_MIN"), value("MPC_THR_MAX")
+    # 1: linear over the full range, so the centre is not the hover thrust.
     if value("MPC_THR_CURVE") == 1.0:
         return low + 0.5 * (throttle + 1.0) * (high - low)
     hover = value("MPC_THR_HOVER")
