@@ -12,14 +12,8 @@ from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.loading import PublishedRun, load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import measures
+from airl_mav.report.comparison import comparison_model
 from airl_mav.report.comparison.build import compare, comparison_document, worst_seeds
-from airl_mav.report.comparison.comparison_model import (
-    ComparedRun,
-    Comparison,
-    Contrast,
-    ContrastEntry,
-    RunEntry,
-)
 from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_picture
 from airl_mav.report.comparison.tables import (
     THE_PAPER,
@@ -39,7 +33,7 @@ WITH_TRAINED, WITHOUT_TRAINED = "with-mitigation-trained", "without-mitigation-t
 COMPENSATED = "compensated"
 
 
-def hardware_gap_sentence(comparison: Comparison, arena: str) -> str:
+def hardware_gap_sentence(comparison: comparison_model.Comparison, arena: str) -> str:
     """Return a sentence on the gap of an arena; empty without reference or target."""
     gaps = {c.entry.key: c for c in reversed(comparison.contrasts_of(arena))}
     if (gap := gaps.get(WITHOUT)) is None:
@@ -72,14 +66,14 @@ def hardware_gap_sentence(comparison: Comparison, arena: str) -> str:
     return f"{sentence}."
 
 
-def _computer(run: ComparedRun) -> str:
+def _computer(run: comparison_model.ComparedRun) -> str:
     name, mean = Path(run.setup.computer.name).stem, run.stages["t2"].mean
     if mean is None:
         return name
     return f"{name} (t2 {mean / US_PER_MS:,.{0 if mean >= 10.0 * US_PER_MS else 1}f} ms)"
 
 
-def _longer(contrast: Contrast) -> str:
+def _longer(contrast: comparison_model.Contrast) -> str:
     """Return a gap of the flight time as a comparative without `than`."""
     difference = measures.FLIGHT_TIME.change(contrast.paired).difference
     if difference.value is None:
@@ -93,7 +87,7 @@ def _interval(difference: Estimate) -> str:
     return f" ({text})" if text else ""
 
 
-def _rate(run: ComparedRun) -> str:
+def _rate(run: comparison_model.ComparedRun) -> str:
     rate = run.quality.success_rate
     return "none" if rate.value is None else f"{100.0 * rate.value:.1f} %"
 
@@ -117,35 +111,43 @@ _TRAINED = "mitigation, reference delay-trained (the paper's way)"
 _NO_MITIGATION, _MITIGATED = "no mitigation", "mitigated"
 
 GAP_KINDS = (
-    ContrastEntry("target", "reference", WITHOUT, f"without {_UNDELAYED}", _NO_MITIGATION),
-    ContrastEntry(
+    comparison_model.ContrastEntry(
+        "target", "reference", WITHOUT, f"without {_UNDELAYED}", _NO_MITIGATION
+    ),
+    comparison_model.ContrastEntry(
         "compensated",
         "reference",
         COMPENSATED,
         "compensated in flight, not retrained, reference undelayed",
         "compensated",
     ),
-    ContrastEntry(
+    comparison_model.ContrastEntry(
         "compensated-pipelined",
         "reference",
         "compensated-pipelined",
         "compensated in flight, pipelined decisions, reference undelayed",
         "compensated, pipelined",
     ),
-    ContrastEntry("mitigated", "reference", WITH, f"with {_UNDELAYED}", _MITIGATED),
-    ContrastEntry(
+    comparison_model.ContrastEntry(
+        "mitigated", "reference", WITH, f"with {_UNDELAYED}", _MITIGATED
+    ),
+    comparison_model.ContrastEntry(
         "mitigated-compensated",
         "reference",
         "both",
         "retrained and compensated in flight, reference undelayed",
         "mitigated, compensated",
     ),
-    ContrastEntry("target", "training", WITHOUT_TRAINED, f"without {_TRAINED}", _NO_MITIGATION),
-    ContrastEntry("mitigated", "training", WITH_TRAINED, f"with {_TRAINED}", _MITIGATED),
-    ContrastEntry(
+    comparison_model.ContrastEntry(
+        "target", "training", WITHOUT_TRAINED, f"without {_TRAINED}", _NO_MITIGATION
+    ),
+    comparison_model.ContrastEntry(
+        "mitigated", "training", WITH_TRAINED, f"with {_TRAINED}", _MITIGATED
+    ),
+    comparison_model.ContrastEntry(
         "mitigated", "target", HELP, "mitigation against none, both on the target", "mitigation"
     ),
-    ContrastEntry(
+    comparison_model.ContrastEntry(
         "mitigated-reference",
         "reference",
         COST,
@@ -158,8 +160,10 @@ several runs, one per source of latency."""
 
 
 def build_hardware_gap(
-    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
-) -> Comparison:
+    facts: Mapping[str, Any],
+    entries: Sequence[comparison_model.RunEntry],
+    runs: Mapping[str, LoadedRun],
+) -> comparison_model.Comparison:
     """Return the gaps by `role` and arena (`group`), with published gaps and the worst seeds."""
     contrasts = [
         replace(kind, target=target.name, reference=reference.name)
@@ -206,7 +210,9 @@ def build_hardware_gap(
     return replace(comparison, answers=tuple(sentence for sentence in told if sentence))
 
 
-def _published_columns(comparison: Comparison, arena: str) -> tuple[str, dict[str, PublishedRun]]:
+def _published_columns(
+    comparison: comparison_model.Comparison, arena: str
+) -> tuple[str, dict[str, PublishedRun]]:
     """Return title and columns, by run name, of the published table for the same setup."""
     facts = comparison.facts
     asked = facts.get("computer"), facts.get("reference"), facts.get("latency")
@@ -235,7 +241,7 @@ def _as_late(t2_us: float | None, published_ms: float) -> bool:
 # --- tables
 
 
-def runs_table(comparison: Comparison, arena: str) -> TableView:
+def runs_table(comparison: comparison_model.Comparison, arena: str) -> TableView:
     """Return the results of an arena's runs, one per row, each followed by published values."""
     columns = (
         Column("", number=False),
@@ -276,7 +282,7 @@ def runs_table(comparison: Comparison, arena: str) -> TableView:
     )
 
 
-def gaps_table(comparison: Comparison, arena: str) -> TableView:
+def gaps_table(comparison: comparison_model.Comparison, arena: str) -> TableView:
     """Return all gaps of an arena with intervals, each followed by the published gap."""
     notes = []
     runs = comparison.group(arena)
@@ -304,7 +310,9 @@ def gaps_table(comparison: Comparison, arena: str) -> TableView:
     return contrasts_table(comparison, comparison.contrasts_of(arena), "Hardware gap", notes)
 
 
-def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+def document_of(
+    comparison: comparison_model.Comparison, runs: Mapping[str, LoadedRun], folder: Path
+) -> Document:
     """Return the document of a hardware gap."""
     sections = [
         section
@@ -322,7 +330,7 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
 
 
 def _arena_sections(
-    comparison: Comparison, runs: Mapping[str, LoadedRun], arena: str
+    comparison: comparison_model.Comparison, runs: Mapping[str, LoadedRun], arena: str
 ) -> list[Section]:
     name = Path(arena).stem
     flown, contrasts = comparison.group(arena), comparison.contrasts_of(arena)

@@ -15,13 +15,8 @@ from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.loading import load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
+from airl_mav.report.comparison import comparison_model
 from airl_mav.report.comparison.build import compare, comparison_document
-from airl_mav.report.comparison.comparison_model import (
-    Comparison,
-    Contrast,
-    ContrastEntry,
-    RunEntry,
-)
 from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
 from airl_mav.report.document import Column, Document, Section, TableView, ms
 from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, QualityMeasure
@@ -89,18 +84,24 @@ FEWEST = 10
 
 
 def build_latency_sweep(
-    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
-) -> Comparison:
+    facts: Mapping[str, Any],
+    entries: Sequence[comparison_model.RunEntry],
+    runs: Mapping[str, LoadedRun],
+) -> comparison_model.Comparison:
     """Compare the latencies (`label`, increasing) of each policy (`group`)."""
-    contrasts: list[ContrastEntry] = []
+    contrasts: list[comparison_model.ContrastEntry] = []
     for policy in dict.fromkeys(entry.group for entry in entries):
         line = [entry for entry in entries if entry.group == policy]
         first = line[0]
         for run in line[1:]:
             title = f"{run.label} against {first.label}"
-            contrasts.append(ContrastEntry(run.name, first.name, AGAINST_FIRST, title))
+            contrasts.append(
+                comparison_model.ContrastEntry(run.name, first.name, AGAINST_FIRST, title)
+            )
         for a, b in pairwise(line):
-            contrasts.append(ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}"))
+            contrasts.append(
+                comparison_model.ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}")
+            )
     title = "Latency sweep"
     comparison = compare(
         runs, contrasts, kind="latency-sweep", title=title, facts=facts, entries=entries
@@ -109,7 +110,9 @@ def build_latency_sweep(
     return replace(comparison, answers=tuple(told))
 
 
-def contrasts_by_key(comparison: Comparison, policy: str, key: str) -> list[Contrast]:
+def contrasts_by_key(
+    comparison: comparison_model.Comparison, policy: str, key: str
+) -> list[comparison_model.Contrast]:
     """Return a policy's contrasts with the first or the previous latency, by `key`."""
     return [c for c in comparison.contrasts_of(policy) if c.entry.key == key]
 
@@ -117,7 +120,7 @@ def contrasts_by_key(comparison: Comparison, policy: str, key: str) -> list[Cont
 # --- the verdict
 
 
-def _verdict(comparison: Comparison, policy: str) -> list[str]:
+def _verdict(comparison: comparison_model.Comparison, policy: str) -> list[str]:
     """Return sentences on the cost of each step and on its monotonicity."""
     steps = contrasts_by_key(comparison, policy, STEP)
     lines = [f"{policy}, {measure.title}: {_monotone(measure, steps)}" for measure in LOSSES]
@@ -126,7 +129,7 @@ def _verdict(comparison: Comparison, policy: str) -> list[str]:
     return [*lines, f"{policy}, success {_success_trend(steps)}: {told} %."]
 
 
-def _success_trend(steps: Sequence[Contrast]) -> str:
+def _success_trend(steps: Sequence[comparison_model.Contrast]) -> str:
     rises = [(step.entry.title, step.paired.success_rate.difference) for step in steps]
     if sure := [title for title, d in rises if d.low is not None and d.low > 0.0]:
         return f"not monotone, it rises at {', '.join(sure)}"
@@ -135,7 +138,7 @@ def _success_trend(steps: Sequence[Contrast]) -> str:
     return "never rises"
 
 
-def _monotone(measure: QualityMeasure, steps: Sequence[Contrast]) -> str:
+def _monotone(measure: QualityMeasure, steps: Sequence[comparison_model.Contrast]) -> str:
     changes = [(step.entry.title, measure.change(step.paired).difference) for step in steps]
     known = [(title, d) for title, d in changes if d.value is not None and d.n >= FEWEST]
     if not known:
@@ -155,7 +158,7 @@ def _monotone(measure: QualityMeasure, steps: Sequence[Contrast]) -> str:
 # --- tables and figures
 
 
-def latency_quality_table(comparison: Comparison, policy: str) -> TableView:
+def latency_quality_table(comparison: comparison_model.Comparison, policy: str) -> TableView:
     """Return the results at each latency."""
     columns = (
         Column("latency", number=False),
@@ -205,7 +208,7 @@ def _published_losses(number: int) -> tuple[float, ...]:
     return gap.flight_time_percent, gap.distance_percent, gap.energy_percent
 
 
-def curve_pictures(comparison: Comparison) -> list[FigureImage]:
+def curve_pictures(comparison: comparison_model.Comparison) -> list[FigureImage]:
     """Draw success rate and losses of time, distance and energy over the mean t2."""
     at_ms = {run.name: (run.stages["t2"].mean or 0.0) / US_PER_MS for run in comparison.runs}
     success = [
@@ -247,7 +250,7 @@ def curve_pictures(comparison: Comparison) -> list[FigureImage]:
     return pictures
 
 
-def policy_tables(comparison: Comparison, policy: str) -> tuple[TableView, ...]:
+def policy_tables(comparison: comparison_model.Comparison, policy: str) -> tuple[TableView, ...]:
     """Return tables of each latency: results, contrasts with the first and the previous one."""
     return (
         latency_quality_table(comparison, policy),
@@ -261,7 +264,7 @@ def policy_tables(comparison: Comparison, policy: str) -> tuple[TableView, ...]:
     )
 
 
-def curves_section(comparison: Comparison) -> Section:
+def curves_section(comparison: comparison_model.Comparison) -> Section:
     """Return the section of the curves, including the published curve."""
     return Section(
         "Over latency",
@@ -271,7 +274,9 @@ def curves_section(comparison: Comparison) -> Section:
     )
 
 
-def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+def document_of(
+    comparison: comparison_model.Comparison, runs: Mapping[str, LoadedRun], folder: Path
+) -> Document:
     """Return the document of a latency sweep."""
     return comparison_document(
         comparison,
