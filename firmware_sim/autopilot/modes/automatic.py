@@ -139,6 +139,9 @@ def aim(context: interface.FlightContext) -> None:
     )
 
 
+ABOVE_HOME_M = 0.3
+"""Minimum height above home of a setpoint that lifts a standing vehicle [m]."""
+
 STANDING_M_S = 0.3
 """Speed below which a vehicle counts as stopped: Hold and Land then keep the position [m/s]."""
 

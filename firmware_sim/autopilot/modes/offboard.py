@@ -18,14 +18,11 @@ from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.error_state import RATES
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes import interface
-from firmware_sim.autopilot.modes.automatic import Hold
+from firmware_sim.autopilot.modes.automatic import ABOVE_HOME_M, Hold
 from firmware_sim.autopilot.modes.interface import ModeRequest
 
 CLIMBS_M_S = 0.1
 """Minimum climb rate of a setpoint that lifts a standing vehicle [m/s]."""
-
-ABOVE_HOME_M = 0.3
-"""Minimum height above home of a setpoint that lifts a standing vehicle [m]."""
 
 HOVER = Demand(interface.FREE, (0.0, 0.0, 0.0), interface.NAN, interface.NAN)
 """PX4's fallback for a setpoint with an uncommanded axis (PositionControl::inputValid)."""
