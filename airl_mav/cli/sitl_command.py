@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -91,13 +92,11 @@ def on_this_host(
 ) -> tuple[ResolvedScenario, str]:
     """Return the scenario to fly, and a warning if this host does not keep real time.
 
-    A user at a terminal may choose level lockstep instead. Otherwise the flights begin after the
-    warning.
+    A user at a terminal may choose level lockstep. Otherwise the flights begin after the warning.
     """
     asked = scenario.scenario
-    if asked.level != "sitl" or not asked.validity:
-        return scenario, ""
-    if not (problem := host_problem(scenario.speed or 1.0)):
+    checked = asked.level == "sitl" and asked.validity
+    if not (checked and (problem := host_problem(scenario.speed or 1.0))):
         return scenario, ""
     warning = f"warning: flights may be invalid, as this host does not keep real time: {problem}"
     try:
@@ -115,13 +114,8 @@ def on_this_host(
 
 def lockstep_command(words: Sequence[str]) -> str:
     """Return the command line for the same flights at level lockstep, in a new run folder."""
-    kept: list[str] = []
-    skips = False
-    for word in words[1:] if words[:1] == ["sitl"] else words:
-        if not skips and word != "--out" and not word.startswith("--out="):
-            kept.append(word)
-        skips = word == "--out"
-    return shlex.join(["airl-sitl", *kept, "--level", "lockstep"])
+    given = re.sub(r"^sitl(?= |$)|--out[ =]('[^']*'|\S+)", "", shlex.join(words))
+    return " ".join(["airl-sitl", *given.split(), "--level lockstep"])
 
 
 def video_of(

@@ -19,13 +19,10 @@ TICKS = 500
 """Maximum number of ticks: two seconds."""
 
 PUNCTUAL_TICKS = 125
-"""Number of ticks after which the check ends on a punctual host."""
-
-PUNCTUAL_US = TICK_US
-"""Maximum lateness of a tick on a punctual host [µs]."""
+"""Number of ticks after which the check ends, unless one was later than a tick."""
 
 LOOPS = 20_000
-"""Iterations of an empty loop that take the processor time of the firmware's tick, 0.5 ms."""
+"""Iterations of an empty loop that take as long as the firmware's tick, 0.5 ms."""
 
 LATE_MS = 20.0
 """Maximum lateness of a tick [ms]."""
@@ -50,7 +47,7 @@ def greatest_lateness_ms(speed: float, ticks: int = TICKS) -> float:
     for number in range(1, ticks + 1):
         due_us = number * TICK_US
         late_us = max(late_us, pacing.wait(due_us, (), lambda _now_us: None) - due_us)
-        if number == PUNCTUAL_TICKS and late_us < PUNCTUAL_US:
+        if number == PUNCTUAL_TICKS and late_us < TICK_US:
             break
         for _ in range(LOOPS):
             pass

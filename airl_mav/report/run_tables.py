@@ -383,19 +383,7 @@ def show_report(
     draw: bool = True,
     tables: bool = True,
 ) -> Path | None:
-    """Print a run's tables, then the place of its page (or the command for it), then the verdict.
-
-    Args:
-        run: Flights to report.
-        verdict: Verdict on the flights, saved as `verdict.json`.
-        console: Console for tables and verdict.
-        progress: Receiver of progress reports.
-        draw: True to draw the page.
-        tables: True to print the tables, which the page also contains.
-
-    Returns:
-        Path of the page; None = not drawn.
-    """
+    """Print `tables` of a run, `draw` and print its page, then print the verdict; save both."""
     progress = progress or Progress()
     if run.episodes:
         save_verdict(verdict, run.path)
@@ -408,7 +396,11 @@ def show_report(
 
         progress.status(DRAWING)
         progress.line(DRAWING)
-        page = write_report(run, verdict=verdict)
+        try:
+            page = write_report(run, verdict=verdict)
+        except KeyboardInterrupt:
+            print_verdict(verdict.lines, console)
+            raise
         progress.status(None)
     if run.episodes:
         place = page or f"airl report {shlex.quote(str(run.path))}"

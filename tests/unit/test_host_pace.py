@@ -103,10 +103,10 @@ def test_the_proposed_command_flies_into_a_new_folder() -> None:
         "--latency",
         "lognormal:60ms,10ms",
         "--out=x",
-        "my file.toml",
+        "runs/a.toml",
     ]
     assert lockstep_command(words) == (
-        "airl-sitl --latency lognormal:60ms,10ms 'my file.toml' --level lockstep"
+        "airl-sitl --latency lognormal:60ms,10ms runs/a.toml --level lockstep"
     )
 
 
