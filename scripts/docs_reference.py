@@ -1,6 +1,8 @@
-"""Generator of reference sections in the documentation site, run by mkdocs as a hook.
+"""Generator of reference pages in the documentation site, run by mkdocs as a hook.
 
-A page requests a section with a comment on a separate line:
+The home page is README.md. docs/reference/api.md lists objects (`::: NAME`): each gets a page in
+reference/api, and each command one in reference/commands. A page requests a section with a comment
+on a separate line:
 
 - `<!-- fields: MODULE:MODEL -->` becomes a table of the fields of a pydantic model and of the
   models inside it: name, meaning, unit and range, default.
@@ -22,6 +24,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from unittest import mock
 
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
 ROOT = Path(__file__).resolve().parent.parent
 if str(ROOT) not in sys.path:
     # Documents this checkout instead of an installed version.
@@ -30,7 +35,16 @@ if str(ROOT) not in sys.path:
 from pydantic import BaseModel  # noqa: E402 (from here on the checkout is found)
 from pydantic.fields import FieldInfo  # noqa: E402
 
+from airl_mav.cli.main import subcommands  # noqa: E402
 from airl_mav.core.fields import range_of, unit_of  # noqa: E402
+
+HOME, API, COMMANDS = "index.md", "reference/api.md", "reference/commands.md"
+
+OBJECT = re.compile(r"^::: ([\w.]+)\n(?: .*\n|\n(?= ))*(?:\n<!-- fields: .* -->\n)?", re.MULTILINE)
+"""Block of an object in the page of the Python API."""
+
+PARTS = {COMMANDS: "reference/commands/{}.md", API: "reference/api/{}.md"}
+"""Pages of parts, by the page that lists them."""
 
 HELP_COLUMNS = "100"
 """Width of wrapped help texts."""
@@ -38,11 +52,104 @@ HELP_COLUMNS = "100"
 _WHERE = re.compile(r"([\w.]+):(\w+)(?:\[(.+)\]\.(\w+))?")
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace the comments of a page; called by mkdocs for every page."""
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Put the generated pages into the navigation, below the pages that list them."""
+    config.nav = [_with_parts(entry) for entry in config.nav or []]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the home page, a page per command and a page per object of the Python API."""
+    pages = {HOME: home_page((ROOT / "README.md").read_text(encoding="utf-8"))}
+    pages |= command_pages() | object_pages(api_text())
+    for path, text in pages.items():
+        files.append(File.generated(config, path, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Replace the comments of a page, and link parts to their pages; called for every page."""
+    if page.file.src_uri == API:
+        markdown = OBJECT.sub(_object_link, markdown)
+    elif page.file.src_uri == COMMANDS:
+        rows = (f"| [{name}](commands/{file_of(name)}.md) | {what} |" for name, what in commands())
+        markdown += "\n| command | purpose |\n|---|---|\n" + "\n".join(rows) + "\n"
+    markdown = re.sub(r"reference/api\.md#[\w.]*?(\w+)\)", r"reference/api/\1.md)", markdown)
+    markdown = re.sub(r"reference/commands\.md#([\w-]+)\)", r"reference/commands/\1.md)", markdown)
     return re.sub(
         r"^<!-- (fields|help|tables): (.+?) -->$", _generated, markdown, flags=re.MULTILINE
     )
+
+
+def _with_parts(entry: Any) -> Any:
+    """Return an entry of the navigation, with the pages of its parts."""
+    ((title, target),) = entry.items()
+    if isinstance(target, list):
+        return {title: [each if isinstance(each, str) else _with_parts(each) for each in target]}
+    if target == COMMANDS:
+        parts = [{name: PARTS[target].format(file_of(name))} for name, _ in commands()]
+    elif target == API:
+        names = (last_name(each) for each in OBJECT.findall(api_text()))
+        parts = [{name: PARTS[target].format(name)} for name in names]
+    else:
+        return entry
+    return {title: [target, *parts]}
+
+
+def home_page(readme: str) -> str:
+    """Return the home page: the README with links as seen from docs/."""
+    readme = re.sub(r"\]\(docs/", "](", readme)
+    source = "https://github.com/airl-mav/airl-mav/blob/main/"
+    return re.sub(r"\]\(([A-Z]+\.(?:md|cff))\)", rf"]({source}\1)", readme)
+
+
+def commands() -> list[tuple[str, str]]:
+    """Return names and purposes of all commands."""
+    alone = ("sitl", "firmware", "companion")
+    return [
+        (f"airl-{name}" if name in alone else f"airl {name}", row[0])
+        for name, row in subcommands().items()
+    ]
+
+
+def command_pages() -> dict[str, str]:
+    """Return a page for each command: its help with all options."""
+    return {
+        PARTS[COMMANDS].format(file_of(name)): f"# {name}\n\n<!-- help: {name} -->\n"
+        for name, _ in commands()
+    }
+
+
+def object_pages(listed: str) -> dict[str, str]:
+    """Return a page for each object that the page of the Python API lists."""
+    pages = {}
+    for match in OBJECT.finditer(listed):
+        name = last_name(match[1])
+        text = match[0].replace("heading_level: 3", "heading_level: 2")
+        pages[PARTS[API].format(name)] = f"# {name}\n\n{text}"
+    return pages
+
+
+def api_text() -> str:
+    """Return the source of the page of the Python API."""
+    return (ROOT / "docs" / API).read_text(encoding="utf-8")
+
+
+def file_of(command: str) -> str:
+    """Return the name of a command's page."""
+    return command.replace(" ", "-")
+
+
+def last_name(dotted: str) -> str:
+    """Return the last part of a dotted name."""
+    return dotted.rsplit(".", 1)[-1]
+
+
+def _object_link(match: re.Match[str]) -> str:
+    """Return the link to an object's page, with the first line of its docstring."""
+    module, name = match[1].rsplit(".", 1)
+    summary = (getattr(importlib.import_module(module), name).__doc__ or "").strip()
+    return f"- [`{name}`](api/{name}.md): {summary.splitlines()[0] if summary else match[1]}\n"
 
 
 def _generated(match: re.Match[str]) -> str:
