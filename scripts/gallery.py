@@ -1,6 +1,6 @@
 """Galleries of the documentation: every built-in arena, vehicle and policy with a picture.
 
-    python scripts/gallery.py           # writes docs/gallery/*.md and docs/images/gallery/*.png
+    python scripts/gallery.py           # writes docs/gallery/*.md, and missing docs/images/gallery/*.png
     python scripts/gallery.py --pages   # writes the pages only, from profiles and policy cards
 
 The commands under the pictures are the ones that draw them.
@@ -229,8 +229,9 @@ def main() -> None:
         if not options.pages:
             for entry in entries:
                 for file, draw in entry.pictures.items():
-                    print(file, flush=True)
-                    draw(PICTURES / file)
+                    if not (PICTURES / file).exists():
+                        print(file, flush=True)
+                        draw(PICTURES / file)
     if not options.pages:
         draw_gap(PICTURES.parent / "hardware-gap.png")
 

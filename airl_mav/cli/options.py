@@ -299,6 +299,7 @@ EXTRAS = {
     "jpeg": ("PIL",),
     "mesh": ("trimesh",),
     "profile": ("onnx",),
+    "data": ("minari", "pandas", "pyarrow"),
     "identify": ("mcap", "pyulog"),
     "render": ("mitsuba",),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "PIL", "pymavlink", "scipy"),

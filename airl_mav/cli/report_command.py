@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 from rich.console import Console
@@ -50,6 +50,9 @@ class ReportOptions(ProfileModel):
         description="with one black box: the flight controller's own log of that flight (.ulg),"
         " used for path, power and motor outputs",
     )
+    figures: tuple[Literal["pdf", "svg"], ...] = Field(
+        default=(), description="also write the figures of a run in these formats, for papers"
+    )
     trust: TrustArenas = False
 
 
@@ -78,11 +81,13 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
             raise FieldError(field, f"{value}", "with two runs or more")
     if kind_of(first) is None:
         # Imported here and below: options do not need the figures.
+        from airl_mav.report import theme
         from airl_mav.report.run_tables import show_report
         from airl_mav.report.run_verdict import verdict_of
 
         loaded = load(first)
-        show_report(loaded, verdict_of(loaded), console)
+        with theme.figure_files(first, options.figures):
+            show_report(loaded, verdict_of(loaded), console)
     else:
         from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
 

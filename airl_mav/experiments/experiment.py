@@ -30,6 +30,7 @@ from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
 from airl_mav.report.document import count_flights
+from airl_mav.report.run_columns import TABLES, Columns, TableName
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
@@ -301,6 +302,14 @@ class Run:
     def complete(self) -> bool:
         """True if all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
+
+    def table(self, name: TableName = "episodes") -> Columns:
+        """Return a table as columns by name; `pandas.DataFrame(run.table())` reads it.
+
+        Args:
+            name: `episodes`, `decisions`, `latency` or `trajectories`.
+        """
+        return TABLES[name](self._loaded)
 
     def _repr_html_(self) -> str | None:
         """Return the notebook view: the verdict, the statistics and a map of the flights."""

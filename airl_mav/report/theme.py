@@ -5,9 +5,12 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
@@ -195,9 +198,31 @@ def share_grid(axes: Sequence[Axes]) -> None:
         ax.add_collection(grid, autolim=False)
 
 
+_FILES: ContextVar[tuple[Path, tuple[str, ...]] | None] = ContextVar("figure files", default=None)
+
+
+@contextmanager
+def figure_files(folder: Path, formats: tuple[str, ...]) -> Iterator[None]:
+    """Write every figure that is rendered in this context as files for print, too.
+
+    Args:
+        folder: Folder of the files, named after the figures.
+        formats: Formats of matplotlib, such as `pdf`.
+    """
+    token = _FILES.set((folder, formats))
+    try:
+        yield
+    finally:
+        _FILES.reset(token)
+
+
 def render(figure: Figure, name: str, alt: str) -> FigureImage:
     """Render a figure. The output is reproducible: no dates, no random identifiers."""
     png = render_png(figure)
+    folder, formats = _FILES.get() or (Path(), ())
+    for form in formats:
+        metadata = {"CreationDate": None} if form == "pdf" else {"Date": None}
+        figure.savefig(folder / f"{name}.{form}", metadata=metadata)
     svg = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(svg, format="svg", dpi=SVG_DPI, metadata={"Date": None, "Creator": None})
