@@ -107,8 +107,8 @@ def commands() -> list[tuple[str, str]]:
     """Return names and purposes of all commands."""
     alone = ("sitl", "firmware", "companion")
     return [
-        (f"airl-{name}" if name in alone else f"airl {name}", row[0])
-        for name, row in subcommands().items()
+        (f"airl-{name}" if name in alone else f"airl {name}", purpose)
+        for name, (_, purpose, _) in subcommands().items()
     ]
 
 

@@ -1,6 +1,6 @@
 """Galleries of the documentation: every built-in arena, vehicle and policy with a picture.
 
-    python scripts/gallery.py           # writes docs/gallery/*.md, and missing docs/images/gallery/*.png
+    python scripts/gallery.py           # writes docs/gallery/*.md and missing pictures
     python scripts/gallery.py --pages   # writes the pages only, from profiles and policy cards
 
 The commands under the pictures are the ones that draw them.

@@ -8,7 +8,8 @@ Guide: docs/how-to/airframe-check.md.
 
 COMMANDS = {
     "vehicle": (
-        "hover throttle, endurance, top speed and step responses of an aircraft",
+        "measure",
+        "check hover throttle, endurance and step responses",
         "airl_mav.addons.airframe_check.airframe_check",
     )
 }

@@ -17,9 +17,8 @@ from airl_mav.core.progress import new_console
 from airl_mav.envs import fleet, stopping
 from airl_mav.envs.fleet_step import advance
 from airl_mav.flight.energy import level_powers_w
-from airl_mav.profiles.conditions import Payload, equipped
 from airl_mav.profiles.parameters import flown_values
-from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
+from airl_mav.profiles.vehicle import CORNERS, Payload, VehicleProfile, equipped
 from airl_mav.report import document
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
 from airl_mav.vehicle.power import PowerModel, standing_power_w

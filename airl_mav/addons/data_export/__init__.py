@@ -7,7 +7,8 @@ Guide: docs/how-to/export-data.md.
 
 COMMANDS = {
     "export-data": (
-        "a run as CSV or Parquet tables, or as a Minari or LeRobot data set",
+        "logs",
+        "write tables or data sets: CSV, Parquet, Minari, LeRobot",
         "airl_mav.addons.data_export.export_data",
     )
 }
