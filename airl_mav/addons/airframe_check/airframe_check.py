@@ -109,7 +109,7 @@ def check_airframe(
     """
     profile, board = equipped(vehicle, computer, payload or Payload())
     airframe = Airframe.from_profile(profile)
-    constants = stopping.twin_of(profile)
+    constants = stopping.gym_constants_of(profile)
     weight_n = airframe.mass * GRAVITY_M_S2
     share = weight_n / profile.thrust_n
     energy_j = profile.battery.energy_j(1.0)
