@@ -63,11 +63,11 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         option = "tell_obstacles", True
         load_entry("companion", "REPORTS", "vehicle", option, "vehicle_reports")
     policy = find_policy(asked.policy, trust=asked.trust)
-    pilot, watchdog = checks.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
+    settings, watchdog = checks.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # Computing time of this computer counts, except in lockstep.
     injection = checks.select_latency(asked, policy, on_this_computer=not asked.lockstep)
     checks.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
-    loaded = checks.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
+    loaded = checks.load_asked_policy(asked, policy, settings.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     # Obstacle messages need depth along the heading; other cameras are rejected before the flight.
     vehicle, compensator = load_vehicle(asked.vehicle), None
@@ -89,8 +89,8 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal)
     )
     # Checked before the compensator is created.
-    checks.check_compensated(pilot, policy, vehicle)
-    if pilot.compensate:
+    checks.check_compensated(settings, policy, vehicle)
+    if settings.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits
     # A stand-alone flight always has a time limit.
@@ -110,13 +110,13 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
         computer_watts=0.0,
         injection=injection,
         speed=asked.speed,
-        between_commands=checks.between_commands(pilot, watchdog.hover_after_s),
+        between_commands=checks.between_commands(settings, watchdog.hover_after_s),
         firmware="not known",
     )
     return MissionSetup(
         goal=asked.goal,
         policy=loaded,
-        pilot=pilot,
+        pilot=settings,
         watchdog=watchdog,
         limits=limits,
         latency=sampler,
