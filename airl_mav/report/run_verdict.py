@@ -141,9 +141,11 @@ def _reached(rate: Estimate, episodes: Sequence[EpisodeRecord]) -> str:
         goals = f"{round(rate.value * rate.n):,} of {rate.n:,} goals reached"
         told.append(f"{goals}, {_percent(rate.scaled(100.0))}")
     if invalid := [episode for episode in episodes if episode.invalid]:
-        goals = sum(episode.outcome is Outcome.SUCCESS for episode in invalid)
+        successes = sum(episode.outcome is Outcome.SUCCESS for episode in invalid)
         flights = "flight" if len(invalid) == 1 else "flights"
-        told.append(f"{len(invalid):,} {flights} flown but invalid ({goals:,} reached the goal)")
+        told.append(
+            f"{len(invalid):,} {flights} flown but invalid ({successes:,} reached the goal)"
+        )
     return "; ".join(told) or "no flight was finished"
 
 
