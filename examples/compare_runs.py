@@ -1,6 +1,6 @@
 """Compare two runs over pairs of flights: `static-obstacles` in calm air and in wind.
 
-In the batch twin, where forty flights take seconds; `level="lockstep"` flies them through MAVSDK.
+Forty flights of the vectorized simulator take seconds. `level="lockstep"` flies them through MAVSDK.
 """
 
 from airl_mav import Scenario, rehearse
