@@ -1,6 +1,6 @@
 """Compare two runs over pairs of flights: `static-obstacles` in calm air and in wind.
 
-Forty flights of the vectorized simulator take seconds. `level="lockstep"` flies them through MAVSDK.
+The vectorized simulator flies them in seconds. `level="lockstep"` uses MAVLink and MAVSDK.
 """
 
 from airl_mav import Scenario, rehearse

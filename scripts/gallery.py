@@ -112,11 +112,11 @@ def policies() -> list[Entry]:
         scenario = Scenario(
             policy=name, arena=arena, vehicle=vehicle, level="gym", episodes=1, seed=SEED
         )
-        facts = f"{card.parameters:,} parameters, decides every {card.hold_s:g} s."
+        facts = f"Parameters: {card.parameters:,}. Decision period: {card.hold_s:g} s."
         for result in card.results[:1]:
             facts += (
-                f" {100.0 * result.success_rate:.1f} % of {result.episodes:,} flights in "
-                f"`{result.arena}` reach the goal."
+                f" Success in `{result.arena}`: {100.0 * result.success_rate:.1f} % of "
+                f"{result.episodes:,} flights."
             )
         entries.append(
             Entry(
