@@ -82,11 +82,14 @@ def vehicles() -> list[Entry]:
     for name in loading.list_profiles("vehicles"):
         profile = load_vehicle(name)
         camera, body = profile.camera, profile.body
-        show = "rgb" if camera.kind == "rgb" else "depth"
-        view = (
-            f"airl render dense-obstacles --seed {SEED} --camera {name} --show {show}"
-            " --out view.png"
-        )
+        taken = f"airl render dense-obstacles --seed {SEED}"
+        if camera.kind == "depth":
+            # At least as many rows as `airl render` accepts; a lidar has one.
+            size = f"--width-px {camera.width_px} --height-px {max(8, camera.height_px)}"
+            lens = f"--projection {camera.projection} --fov-deg {camera.horizontal_fov_deg:g}"
+            view = f"{taken} --show depth {size} {lens} --out view.png"
+        else:
+            view = f"{taken} --camera {name} --out view.png"
         facts = (
             f"Mass {body.mass_kg:g} kg. Main camera: {camera.kind}, {camera.width_px} x "
             f"{camera.height_px} pixels, {camera.horizontal_fov_deg:g}°, {camera.rate_hz:g} Hz."
