@@ -27,9 +27,7 @@ from pyulog.exceptions import ULogException
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate, correlation_lags
 
-from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
-from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_from_euler
+from airl_mav.core import constants, errors, frames
 from airl_mav.flight.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -162,22 +160,22 @@ def read_vehicle_log(path: Path) -> VehicleLog:
         with path.open("rb") as file:
             read = ULog(file, sorted({topic for topic, _ in _SERIES.values()}))
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
+        raise errors.UsageError(f"{path}: {error.strerror}") from None
     except _BROKEN:
-        raise UsageError(f"{path}: accepted: {accepted}") from None
+        raise errors.UsageError(f"{path}: accepted: {accepted}") from None
     # First instance of each topic; reversed, so that the first entry wins.
     topics = {each.name: each.data for each in reversed(read.data_list) if each.multi_id == 0}
     series = {name: _series(topics, *columns) for name, columns in _SERIES.items()}
     # Alignment needs a course of both.
     if len(series["attitude"]) < 2 or len(series["motion"]) < 2:
-        raise UsageError(f"{path}: accepted: {accepted}")
+        raise errors.UsageError(f"{path}: accepted: {accepted}")
     # Either topic may have more samples.
     velocity = (*_numbered("velocity", 3), "yawspeed")
     trajectory = _series(topics, "trajectory_setpoint", velocity)
     series["setpoint"] = max(series["setpoint"], trajectory, key=len)
     battery = series["battery"].values
     # An unmeasured current must not look like a small one.
-    battery[battery[:, 1] == UNMEASURED_A, 1] = np.nan
+    battery[battery[:, 1] == constants.UNMEASURED_A, 1] = np.nan
     known = {name: each if name in _PARTLY_NAN else _known(each) for name, each in series.items()}
     return VehicleLog(
         path=path,
@@ -231,7 +229,7 @@ SAME_TURN, SAME_THRUST = 0.001, 0.001
 """Tolerances for equal body rates [rad/s], components of `_down_and_nose`, and thrusts. Unlike yaw
 rates, they reach the log unfiltered."""
 
-LONGEST_LINK_US = US_PER_S
+LONGEST_LINK_US = constants.US_PER_S
 """Maximum uplink delay of a setpoint [µs]."""
 
 
@@ -263,7 +261,7 @@ def align(
     log: VehicleLog,
     sent_us: NDArray[np.int64],
     setpoints: NDArray[np.float64],
-    commands: CommandKind = "velocity",
+    commands: constants.CommandKind = "velocity",
 ) -> ClockAlignment:
     """Return the clock relation of a recorded flight and its vehicle's log, or raise UsageError."""
     # The coarse search over all shifts avoids local minima of the fine one.
@@ -273,7 +271,7 @@ def align(
     error = flown[inside] - logged[inside]
     correlation = _correlation(flown[inside], logged[inside])
     if correlation < LEAST_CORRELATION:
-        raise UsageError(
+        raise errors.UsageError(
             f"{log.path}: its velocities agree with those of the recording by {correlation:.2f} at "
             f"best; accepted: the log of the same flight, {LEAST_CORRELATION:g} or more"
         )
@@ -300,7 +298,7 @@ def _coarse(path: Trajectory, log: VehicleLog) -> float:
     logged = log.motion.at(times[1])[:, 3:].T
     # Without motion every shift correlates equally well.
     if min(len(each) for each in times) < 2 or np.abs(told).max() < LEAST_SPEED_M_S:
-        raise UsageError(
+        raise errors.UsageError(
             f"{log.path}: the clocks cannot be aligned; accepted: a flight with motion of "
             f"{LEAST_SPEED_M_S:g} m/s or more"
         )
@@ -349,7 +347,7 @@ def _inside(path: Trajectory, log: VehicleLog, shift_us: float) -> NDArray[np.bo
     last = min(log.motion.time_us[-1], log.attitude.time_us[-1])
     inside: NDArray[np.bool_] = (times >= first) & (times <= last)
     if not inside.any():
-        raise UsageError(f"{log.path}: accepted: the log of the same flight")
+        raise errors.UsageError(f"{log.path}: accepted: the log of the same flight")
     return inside
 
 
@@ -362,7 +360,7 @@ def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def _accepted(
     sent_us: NDArray[np.int64],
     setpoints: NDArray[np.float64],
-    commands: CommandKind,
+    commands: constants.CommandKind,
     log: VehicleLog,
     told_us: float,
 ) -> tuple[float, float, int]:
@@ -380,14 +378,14 @@ def _accepted(
 
 
 def _looked_for(
-    setpoints: NDArray[np.float64], commands: CommandKind, log: VehicleLog
+    setpoints: NDArray[np.float64], commands: constants.CommandKind, log: VehicleLog
 ) -> Iterator[tuple[NDArray[np.float64], Series, tuple[float, ...]]]:
     """Yield sent setpoints (k, m), their series (n, m) in the log and match tolerances (m,)."""
     if commands == "body_rates":
         yield setpoints, log.rates_setpoint, (*3 * (SAME_TURN,), SAME_THRUST)
         return
     if commands == "attitude":
-        turned = [quat_from_euler(*angles) for angles in setpoints[:, :3].tolist()]
+        turned = [frames.quat_from_euler(*angles) for angles in setpoints[:, :3].tolist()]
         sent = _down_and_nose(np.array(turned).reshape(-1, 4))
         seen = log.attitude_setpoint
         attitude = _down_and_nose(seen.values[:, :4])

@@ -13,10 +13,8 @@ import zmq
 
 from airl_mav.camera.frame import MOST_BYTES, Frame, FrameError
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.addons import load_entry
+from airl_mav.core import addons, constants, errors
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import FieldError
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 MESSAGES_PER_LOOK = 8
@@ -85,14 +83,14 @@ class ZmqFrameSource:
         except zmq.ZMQError as error:
             self.close()
             accepted = f"{error}; accepted: tcp://HOST:PORT, ipc://PATH"
-            raise FieldError("camera", endpoint, accepted) from None
+            raise errors.FieldError("camera", endpoint, accepted) from None
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame without waiting; None before the first frame."""
         # Bounded: a fast publisher must not hold the caller here.
         for _ in range(MESSAGES_PER_LOOK):
             if not self._socket.poll(0):
-                if self._silent.time_us() >= REDIAL_S * US_PER_S:
+                if self._silent.time_us() >= REDIAL_S * constants.US_PER_S:
                     self._redial()
                 break
             # Any message proves the connection, even an invalid one.
@@ -159,7 +157,7 @@ class SharedFrames:
         """Wait for a frame with another sequence; see `FrameSource`."""
         stopwatch = WallClock()
         while True:
-            left_s = timeout_s - stopwatch.time_us() / US_PER_S
+            left_s = timeout_s - stopwatch.time_us() / constants.US_PER_S
             # The lock is released between slices, so that the other thread can read.
             with self._one_at_a_time:
                 found = self._frames.wait(newer_than_sequence, min(max(left_s, 0.0), SHARE_S))
@@ -172,7 +170,7 @@ def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
     port = endpoint.rpartition(":")[2]
     # libzmq would silently truncate the number to 16 bits.
     if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
-        raise FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
+        raise errors.FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
     return ZmqFrameSource(endpoint, clock)
 
 
@@ -206,6 +204,6 @@ def open_named_camera(
     # An address has a scheme; the publisher defines its own camera, so nothing is converted.
     if "://" in name:
         return open_camera(name, clock)
-    open_driver = load_entry("companion", "CAMERAS", "driver", ("camera", name), "cameras")
+    open_driver = addons.load_entry("companion", "CAMERAS", "driver", ("camera", name), "cameras")
     camera: OpenCamera = open_driver(name, clock, wanted, whose, further)
     return camera

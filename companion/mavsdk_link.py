@@ -20,8 +20,7 @@ from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, Tele
 
 from airl_mav.core import constants
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.policy.actions import Attitude
-from airl_mav.policy.observation import Kinematics
+from airl_mav.policy import actions, observation
 from companion import link_interface
 from companion.mavsdk_connection import (
     POSITION,
@@ -231,14 +230,14 @@ class MavsdkLink:
         """True if the heartbeat reports armed (latency up to 1 s)."""
         return bool(self._telemetry.armed())
 
-    def kinematics(self) -> Kinematics:
+    def kinematics(self) -> observation.Kinematics:
         """Return the newest position, velocity, attitude and body rates."""
         # MAVSDK caches the newest values, so these calls do not wait.
         pv = self._telemetry.position_velocity_ned()
         q = self._telemetry.attitude_quaternion()
         w = self._telemetry.attitude_angular_velocity_body()
         p, v = pv.position, pv.velocity
-        return Kinematics(
+        return observation.Kinematics(
             np.array([p.north_m, p.east_m, p.down_m]),
             np.array([v.north_m_s, v.east_m_s, v.down_m_s]),
             np.array([q.w, q.x, q.y, q.z]),
@@ -411,7 +410,7 @@ class MavsdkLink:
             # Three angles or rates in radians, and a thrust that needs no conversion.
             *angles, thrust = setpoint
             degrees = map(math.degrees, angles)
-            if isinstance(setpoint, Attitude):
+            if isinstance(setpoint, actions.Attitude):
                 offboard.set_attitude(OffboardAttitude(*degrees, thrust))
             else:
                 offboard.set_attitude_rate(AttitudeRate(*degrees, thrust))

@@ -22,18 +22,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.latency.injection import LatencySampler
-from airl_mav.latency.stamps import NO_STAMP, DecisionLog
-from airl_mav.policy import actions
+from airl_mav.latency import injection, stamps
+from airl_mav.policy import actions, observation_spec
 from airl_mav.policy.observation import Kinematics, Observation, observe, views_of
-from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.prediction import Compensator, DecisionMemory
-from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.stand_alone import Start as PilotedStart
+from airl_mav.scenario import model, stand_alone
 from companion import link_interface
 from companion.frame_source import FrameSource, ReceivedFrame
 from companion.limits import NOT_OURS, Limits
@@ -51,7 +47,7 @@ FRAME_WAIT_S = 0.1
 ONE = np.zeros(1, np.intp)
 """Index of the only companion in its compensator."""
 
-OLDEST_FRAME_US = US_PER_S
+OLDEST_FRAME_US = constants.US_PER_S
 """Maximum frame age [µs]; older or future frames are stamped by another clock."""
 
 WAITING = "waiting for a frame"
@@ -85,8 +81,8 @@ class Pilot:
     policy: actions.Policy
     watchdog: Watchdog
     clock: Clock
-    settings: PilotSettings
-    latency: LatencySampler | None = None
+    settings: model.PilotSettings
+    latency: injection.LatencySampler | None = None
     """Sampler of the inference time t2, to emulate a slower computer; None = no injection."""
     compensator: Compensator | None = None
     """Latency compensation of image and state, for one companion; None = no compensation."""
@@ -97,19 +93,19 @@ class Pilot:
     memory: DecisionMemory = field(init=False)
     """Setpoints and latencies so far."""
     earlier: deque[tuple[NDArray[Any], Kinematics]] = field(
-        default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
+        default_factory=lambda: deque(maxlen=observation_spec.MOST_FRAMES - 1), init=False
     )
     """Images and states of earlier decisions, newest first."""
     further: deque[dict[str, NDArray[Any]]] = field(
-        default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
+        default_factory=lambda: deque(maxlen=observation_spec.MOST_FRAMES - 1), init=False
     )
     """Images of additional cameras in earlier decisions, by name."""
-    log: DecisionLog = field(init=False)
-    held_us: int = field(default=NO_STAMP, init=False)
+    log: stamps.DecisionLog = field(init=False)
+    held_us: int = field(default=stamps.NO_STAMP, init=False)
 
     def __post_init__(self) -> None:
         """Create the decision log and memory; a compensator's memory is shared."""
-        self.log = DecisionLog(commands=self.settings.commands)
+        self.log = stamps.DecisionLog(commands=self.settings.commands)
         compensator = self.compensator
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
@@ -176,7 +172,7 @@ class Pilot:
         ready_us = clock.time_us()
         # The vertical speed uses the newest position, not that of the frame.
         setpoint = self._setpoint(action)
-        hold_us = int(settings.hold_s * US_PER_S)
+        hold_us = int(settings.hold_s * constants.US_PER_S)
         sent_us = clock.time_us()
         if stop.is_set():
             return None
@@ -190,7 +186,7 @@ class Pilot:
         if not self.watchdog.command(setpoint, hold_us):
             return "watchdog"
         hover_s = self.watchdog.hover_after_s
-        expires_us = None if hover_s is None else sent_us + hold_us + hover_s * US_PER_S
+        expires_us = None if hover_s is None else sent_us + hold_us + hover_s * constants.US_PER_S
         if self.decided is not None:
             # A pipelined decision has no hold: the next one starts at once.
             held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
@@ -279,7 +275,7 @@ FRAME_TIMEOUT_S = 5.0
 """Timeout of the first camera frame [wall s]."""
 
 
-Start: TypeAlias = PilotedStart | Literal["hover"]
+Start: TypeAlias = stand_alone.Start | Literal["hover"]
 """Start of a mission; hover = in Hold in the air, where the companion enters offboard."""
 
 FIRST_PHASE: dict[Start, str] = {
@@ -298,7 +294,7 @@ class MissionResult:
     limit (`limits.py`), or the rejected or failed request."""
     notes: tuple[str, ...]
     """Actions of the watchdog, the broken limit, failures during the landing."""
-    log: DecisionLog
+    log: stamps.DecisionLog
 
 
 @dataclass(frozen=True)
@@ -308,10 +304,10 @@ class Mission:
     goal: Goal
     """North, east of the start [m], and down if it has a height."""
     policy: actions.Policy
-    pilot: PilotSettings
-    watchdog: WatchdogSettings
-    limits: LimitSettings
-    latency: LatencySampler | None = None
+    pilot: model.PilotSettings
+    watchdog: model.WatchdogSettings
+    limits: model.LimitSettings
+    latency: injection.LatencySampler | None = None
     """Sampler of the inference time t2; None = no injection."""
     compensator: Compensator | None = None
     """Latency compensation of image and state; None = no compensation."""
@@ -325,7 +321,7 @@ class Mission:
         scenario: ResolvedScenario,
         goal: Goal,
         policy: actions.Policy,
-        latency: LatencySampler | None,
+        latency: injection.LatencySampler | None,
         compensator: Compensator | None,
     ) -> Mission:
         """Return the mission of a scenario to a goal."""
@@ -443,7 +439,7 @@ def fly_mission(
 def _begin(
     link: MavsdkLink,
     start: Start,
-    settings: PilotSettings,
+    settings: model.PilotSettings,
     stop: threading.Event,
     progress: Callable[[str], None],
 ) -> None:
@@ -500,15 +496,15 @@ def check_camera(
             isinstance(policy, actions.CameraBound)
             and (reason := policy.refuses(camera)) is not None
         ):
-            raise UsageError(f"--policy {policy.name}: {reason}")
+            raise errors.UsageError(f"--policy {policy.name}: {reason}")
         lenses = received.frame.lenses
         if (
             isinstance(policy, actions.RigBound)
             and (reason := policy.refuses_further(lenses)) is not None
         ):
-            raise UsageError(f"--policy {policy.name}: in the frames that come: {reason}")
+            raise errors.UsageError(f"--policy {policy.name}: in the frames that come: {reason}")
         if compensator is not None and camera != compensator.intrinsics:
-            raise FieldError(
+            raise errors.FieldError(
                 "compensate",
                 True,
                 problem=f"the camera is {camera}; accepted: that of the vehicle's profile,"

@@ -14,12 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.addons import entries, load, load_entry
+from airl_mav.core import addons, constants, errors, machine, scheduling
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.machine import describe_machine
-from airl_mav.core.scheduling import held_to
 from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import latency_generator
 from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
@@ -28,9 +24,7 @@ from airl_mav.prediction import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.scenario import checks
-from airl_mav.scenario.model import PilotSettings
-from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
+from airl_mav.scenario import checks, model, stand_alone
 from companion import frame_source, pilot
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RATE_HZ, signed
@@ -54,16 +48,16 @@ class MissionSetup(pilot.Mission):
     setup: Setup
 
 
-def prepare(asked: StandAloneCompanion) -> MissionSetup:
+def prepare(asked: stand_alone.StandAloneCompanion) -> MissionSetup:
     """Check the input and load the policy before any connection, or raise UsageError."""
-    check_companion(asked)
+    stand_alone.check_companion(asked)
     if asked.black_box is not None:
         _recording(asked)
     if asked.tell_obstacles:
         option = "tell_obstacles", True
-        load_entry("companion", "REPORTS", "vehicle", option, "vehicle_reports")
+        addons.load_entry("companion", "REPORTS", "vehicle", option, "vehicle_reports")
     policy = find_policy(asked.policy, trust=asked.trust)
-    settings, watchdog = checks.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
+    settings, watchdog = checks.decide_piloting(asked, policy, model.PilotSettings.goal_radius_m)
     # Computing time of this computer counts, except in lockstep.
     injection = checks.select_latency(asked, policy, on_this_computer=not asked.lockstep)
     checks.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
@@ -79,10 +73,10 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     for need, met in needs.items():
         if asked.tell_obstacles and not met:
             accepted = f"with a vehicle whose camera {need}"
-            raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
+            raise errors.FieldError("tell_obstacles", asked.tell_obstacles, accepted)
     # A policy with a card is checked against the camera's first frame, before take-off.
     if policy.card is None and (reason := camera_refused(policy, vehicle)):
-        raise FieldError(
+        raise errors.FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
         )
     checks.check_goal_height(
@@ -99,7 +93,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
     computer = Part(asked.computer, load_computer(asked.computer).description)
     # Without injection the inference runs at this computer's speed.
     if injection.latency is None:
-        computer = Part("this computer", f"{describe_machine()['cpu']}")
+        computer = Part("this computer", f"{machine.describe_machine()['cpu']}")
     setup = Setup(
         level="flight",
         vehicle=Part(asked.vehicle, vehicle.description),
@@ -129,7 +123,7 @@ def prepare(asked: StandAloneCompanion) -> MissionSetup:
 
 
 def mission_camera(
-    asked: StandAloneCompanion, mission: MissionSetup, clock: Clock
+    asked: stand_alone.StandAloneCompanion, mission: MissionSetup, clock: Clock
 ) -> frame_source.OpenCamera:
     """Open the requested camera. Raises FieldError if it is unusable."""
     vehicle = mission.vehicle
@@ -143,24 +137,24 @@ def mission_camera(
 
 
 def reporting(
-    asked: StandAloneCompanion,
+    asked: stand_alone.StandAloneCompanion,
     mission: MissionSetup,
     link: MavsdkLink,
     camera: frame_source.OpenCamera,
     clock: Clock,
 ) -> AbstractContextManager[frame_source.FrameSource]:
     """Send reports to the vehicle's network, if their add-on is there; return the frames to use."""
-    place = entries("companion", "REPORTS").get("vehicle")
+    place = addons.entries("companion", "REPORTS").get("vehicle")
     if place is None:
         return nullcontext(camera)
-    reports: AbstractContextManager[frame_source.FrameSource] = load(place)(
+    reports: AbstractContextManager[frame_source.FrameSource] = addons.load(place)(
         asked, mission, link, camera, clock
     )
     return reports
 
 
 def recorded(
-    asked: StandAloneCompanion, mission: MissionSetup, link: MavsdkLink, clock: Clock
+    asked: stand_alone.StandAloneCompanion, mission: MissionSetup, link: MavsdkLink, clock: Clock
 ) -> AbstractContextManager[BlackBoxRecorder | None]:
     """Record a mission if requested. Raises FieldError if no file can be written."""
     if asked.black_box is None:
@@ -171,14 +165,14 @@ def recorded(
     return recorder
 
 
-def _recording(asked: StandAloneCompanion) -> Any:
+def _recording(asked: stand_alone.StandAloneCompanion) -> Any:
     """Return the function that records a mission. Raises FieldError without the add-on."""
     option = "black_box", f"{asked.black_box}"
-    return load_entry("companion", "RECORDERS", "black_box", option, "black_box")
+    return addons.load_entry("companion", "RECORDERS", "black_box", option, "black_box")
 
 
 def fly_alone(
-    asked: StandAloneCompanion,
+    asked: stand_alone.StandAloneCompanion,
     mission: MissionSetup,
     stop: threading.Event,
     abandon: threading.Event,
@@ -200,7 +194,7 @@ def fly_alone(
 
     # The order of contexts is the order of closing: the link closes before proxy and camera.
     with (
-        held_to(asked.cpu_quota),
+        scheduling.held_to(asked.cpu_quota),
         closing(mission_camera(asked, mission, clock)) as camera,
         signed(asked.connect, asked.signing_key) as url,
         closing(MavsdkLink(url, clock, abandon)) as link,
@@ -253,16 +247,16 @@ class CheckResult(NamedTuple):
 
 
 def check_on_ground(
-    asked: StandAloneCompanion, mission: MissionSetup, stop: threading.Event
+    asked: stand_alone.StandAloneCompanion, mission: MissionSetup, stop: threading.Event
 ) -> Iterator[CheckResult]:
     """Check a flight's requirements one by one, skipping absent parts, until `stop` is set."""
     clock = WallClock(asked.speed)
     yield CheckResult("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
     # CPU quota as in flight, so that the timed decisions are representative.
-    with held_to(asked.cpu_quota):
+    with scheduling.held_to(asked.cpu_quota):
         try:
             camera = mission_camera(asked, mission, clock)
-        except UsageError as error:
+        except errors.UsageError as error:
             yield CheckResult("camera", False, str(error))
             return
         with closing(camera):
@@ -278,7 +272,7 @@ def check_on_ground(
                     yield from look_at_vehicle(link, mission, stop)
                     if seen is not None and not stop.is_set():
                         yield time_decisions(mission, seen, link.kinematics())
-            except (LinkError, UsageError) as error:
+            except (LinkError, errors.UsageError) as error:
                 yield CheckResult("flight controller", False, str(error))
 
 
@@ -292,13 +286,13 @@ def look_at_camera(
         return
     try:
         pilot.check_camera(mission.policy, camera, stop, mission.compensator)
-    except UsageError as error:
+    except errors.UsageError as error:
         yield CheckResult("camera", False, str(error))
         return
     # Frames are not stored: a driver may send thousands of large frames.
     watch, last, frozen, ages_us = WallClock(), first, True, []
     # The loop counts changes of frames in wall time: rates of real devices.
-    while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
+    while watch.time_us() < LOOK_S * constants.US_PER_S and not stop.is_set():
         newer = camera.wait(last.frame.sequence, 0.5)
         if newer is not None:
             # Equality with the first frame throughout means a frozen image.
@@ -318,7 +312,7 @@ def look_at_camera(
         told += "; every image is the same (a real camera has noise)"
     age_us = float(np.median(ages_us))
     yield CheckResult(
-        "camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on"
+        "camera", True, f"{told}; {age_us / constants.US_PER_MS:.0f} ms old where it is decided on"
     )
 
 
@@ -327,8 +321,8 @@ def look_at_vehicle(
 ) -> Iterator[CheckResult]:
     """Check the telemetry rate, then the reported state."""
     watch, changes, last = WallClock(), 0, link.kinematics()
-    while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
-        watch.sleep_until(watch.time_us() + int(POLL_S * US_PER_S))
+    while watch.time_us() < LOOK_S * constants.US_PER_S and not stop.is_set():
+        watch.sleep_until(watch.time_us() + int(POLL_S * constants.US_PER_S))
         now = link.kinematics()
         # A changed position is the sign of new telemetry.
         changes += not np.array_equal(now.position, last.position)
@@ -384,11 +378,11 @@ def time_decisions(
         return CheckResult("decision", False, f"the policy failed: {what}")
     del took_us[0]
     median_us = float(np.median(took_us))
-    longest_s = max(took_us) / US_PER_S
+    longest_s = max(took_us) / constants.US_PER_S
     bound_s = mission.watchdog.timeout_s()
     return CheckResult(
         "decision",
         longest_s < bound_s,
-        f"t2 {median_us / US_PER_MS:.2f} ms, the median of {DECISIONS}; longest"
+        f"t2 {median_us / constants.US_PER_MS:.2f} ms, the median of {DECISIONS}; longest"
         f" {1e3 * longest_s:.2f} ms, the watchdog's bound is {bound_s:g} s",
     )

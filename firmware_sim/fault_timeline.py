@@ -10,11 +10,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from airl_mav.core.addons import entries, load
+from airl_mav.core import addons, constants, errors, streams
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.streams import Stream, stream
 from airl_mav.faults import FOREVER_US, Fault, Part, active, next_change_us
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
 from firmware_sim.mavlink.endpoint import SharedEndpoint
@@ -98,11 +95,11 @@ class FaultTimeline:
 
     def generator(self, index: int, *more: int) -> np.random.Generator:
         """Return the random generator of a fault, derived from the seed, independent of others."""
-        return stream(self._seed, Stream.FAULTS, index, *more)
+        return streams.stream(self._seed, streams.Stream.FAULTS, index, *more)
 
     def inject(self, fault: Fault) -> None:
         """Start a fault now, regardless of its configured start."""
-        at_s = max(0, self._now_us - self._start_us) / US_PER_S
+        at_s = max(0, self._now_us - self._start_us) / constants.US_PER_S
         self._faults.append(fault.model_copy(update={"phase": None, "at_s": at_s}))
         self._renew(self._now_us - self._start_us)
 
@@ -112,7 +109,7 @@ class FaultTimeline:
         for index, (begin_us, _) in self._acting.items():
             fault = self._faults[index]
             if fault.part in parts:
-                for_s = max(1, since_us - begin_us) / US_PER_S
+                for_s = max(1, since_us - begin_us) / constants.US_PER_S
                 self._faults[index] = fault.model_copy(update={"for_s": for_s})
         self._renew(since_us)
 
@@ -183,10 +180,10 @@ def fault_effect(place: str) -> Any:
 
     Raises UsageError without the add-on.
     """
-    effects = entries("firmware_sim", "FAULT_EFFECTS")
+    effects = addons.entries("firmware_sim", "FAULT_EFFECTS")
     if place not in effects:
-        raise UsageError("faults: require the add-on firmware_sim.addons.fault_injection")
-    return load(effects[place])
+        raise errors.UsageError("faults: require the add-on firmware_sim.addons.fault_injection")
+    return addons.load(effects[place])
 
 
 def failing_link(endpoint: SharedEndpoint, clock: Clock, *, conducted: bool = False) -> FailingLink:

@@ -12,18 +12,15 @@ from typing import Protocol
 import numpy as np
 
 from airl_mav.camera.frame import Frame
+from airl_mav.core import clock, constants, files
 from airl_mav.core.addons import entries, load
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.files import save_arrays
 from airl_mav.profiles.projections import SLOW, Renderer
+from firmware_sim import fault_timeline, interfaces
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
-from firmware_sim.fault_timeline import FailingLink
-from firmware_sim.interfaces import ULOG_SUFFIX, FlightController, TrueState
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.traffic import TlogWriter
@@ -82,7 +79,7 @@ class FlightStack(Protocol):
     raise.
     """
 
-    def boot(self, setup: EpisodeSetup) -> FlightController:
+    def boot(self, setup: EpisodeSetup) -> interfaces.FlightController:
         """Boot the flight controller of an episode and wait until it accepts steps.
 
         Raises:
@@ -90,7 +87,7 @@ class FlightStack(Protocol):
             FirmwareLostError: External firmware died while it booted.
         """
 
-    def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], interfaces.TrueState]) -> None:
         """Open MAVLink after the flight controller's first tick.
 
         Args:
@@ -160,7 +157,7 @@ class BuiltinFlightStack:
             autopilot.parameters.on_change(self._changed)
         return autopilot
 
-    def connect(self, tick: Callable[[], int], truth: Callable[[], TrueState]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], interfaces.TrueState]) -> None:
         """Attach the autopilot to the MAVLink server."""
         del tick
         if self._autopilot is not None:
@@ -208,7 +205,7 @@ class Firmware:
         pacing: Pacing,
         *,
         recording: bool = True,
-        failing: FailingLink | None = None,
+        failing: fault_timeline.FailingLink | None = None,
     ) -> None:
         """Create the firmware without an episode.
 
@@ -266,7 +263,7 @@ class Firmware:
         self.logs_lost.clear()
         autopilot = self.flight_stack.boot(setup)
         autopilot.on_message = self._hear
-        start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
+        start_us = (self.clock.time_us() // constants.TICK_US + 1) * constants.TICK_US
         try:
             simulation = Simulation(
                 setup,
@@ -296,7 +293,7 @@ class Firmware:
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us, self._lose_log)
             self.flight_stack.log_to(self._tlog)
-            self._open_flight_log(tlog.with_suffix(ULOG_SUFFIX), start_unix_us)
+            self._open_flight_log(tlog.with_suffix(interfaces.ULOG_SUFFIX), start_unix_us)
         if self.epoch_ns is not None:
             # Objects that live for the whole episode are exempt from garbage collection: a full
             # collection would stall the 250 Hz loop for tens of milliseconds.
@@ -353,7 +350,7 @@ class Firmware:
         """
         simulation, flight_stack = self.simulation, self.flight_stack
         if simulation is None:
-            self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
+            self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * constants.US_PER_S))
             return
         receive, due_us, slipped_us = flight_stack.receive, simulation.time_us, self.slipped_us
         began_us = self._pacing.wait(due_us, self._sockets, receive)
@@ -376,7 +373,7 @@ class Firmware:
             now_us, transport_us = simulation.time_us, camera.transport_us
             if transport_us is None or self.on_frame is not None:
                 transport_us = now_us  # every frame is read
-            simulation.capture_due(now_us - TICK_US, publish, now_us - transport_us)
+            simulation.capture_due(now_us - constants.TICK_US, publish, now_us - transport_us)
         if log is not None and internals is not None:
             log.after_ticks(simulation.flown, simulation.truths, internals.state())
         flight_stack.send(simulation.time_us, simulation.flown)
@@ -394,7 +391,7 @@ class Firmware:
         """Write the episode's arrays and close its logs. The flight continues without logs."""
         if self.simulation is not None:
             strangers = np.array(self.flight_stack.strangers(), np.str_)
-            save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
+            files.save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
             self.close_logs()
 
     def close_logs(self) -> None:
@@ -438,15 +435,15 @@ def fly(
     Without a duration, only `stop` ends the flight. `say` receives one line at a time. Raises
     FirmwareLostError when real firmware is lost.
     """
-    start_us, stopwatch = firmware.clock.time_us(), WallClock()
-    end_us = None if duration_s is None else start_us + int(duration_s * US_PER_S)
+    start_us, stopwatch = firmware.clock.time_us(), clock.WallClock()
+    end_us = None if duration_s is None else start_us + int(duration_s * constants.US_PER_S)
     while not stop.is_set() and (end_us is None or firmware.clock.time_us() < end_us):
         firmware.step()
-    flown_s = (firmware.clock.time_us() - start_us) / US_PER_S
-    wall_s = max(stopwatch.time_us(), 1) / US_PER_S
+    flown_s = (firmware.clock.time_us() - start_us) / constants.US_PER_S
+    wall_s = max(stopwatch.time_us(), 1) / constants.US_PER_S
     say(f"{flown_s:.1f} s simulated in {wall_s:.1f} s: {flown_s / wall_s:.2f} x real time")
     if firmware.slipped_us:
-        given_up_s = firmware.slipped_us / US_PER_S
+        given_up_s = firmware.slipped_us / constants.US_PER_S
         say(f"{given_up_s:.2f} s given up: this host could not keep up")
     for name, link in firmware.flight_stack.counters().items():
         say(

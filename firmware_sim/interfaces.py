@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import Geodetic, Vector
+from airl_mav.core import errors, frames
 
 if TYPE_CHECKING:
     from firmware_sim.autopilot.autopilot import BuiltinAutopilot
@@ -42,8 +41,8 @@ VelocityFrame = Literal["ned", "frd", "body"]
 class GpsFix(NamedTuple):
     """GPS solution."""
 
-    position: Geodetic
-    velocity_ned: Vector  # (3,) [m/s]
+    position: frames.Geodetic
+    velocity_ned: frames.Vector  # (3,) [m/s]
     eph_m: float
     """Horizontal standard deviation [m]."""
     epv_m: float
@@ -60,14 +59,14 @@ class Odometry(NamedTuple):
     unknown.
     """
 
-    position: Vector | None = None  # (3,) in the pose's frame [m]
-    velocity: Vector | None = None  # (3,) in the velocity's frame [m/s]
-    quaternion: Vector | None = None  # (4,) body FRD -> the pose's frame, of length 1
+    position: frames.Vector | None = None  # (3,) in the pose's frame [m]
+    velocity: frames.Vector | None = None  # (3,) in the velocity's frame [m/s]
+    quaternion: frames.Vector | None = None  # (4,) body FRD -> the pose's frame, of length 1
     pose_frame: PoseFrame = "ned"
     velocity_frame: VelocityFrame = "ned"
-    position_variance: Vector = UNKNOWN_VARIANCE  # (3,) [m²]
-    velocity_variance: Vector = UNKNOWN_VARIANCE  # (3,) [m²/s²]
-    orientation_variance: Vector = UNKNOWN_VARIANCE  # (3,) roll, pitch, yaw [rad²]
+    position_variance: frames.Vector = UNKNOWN_VARIANCE  # (3,) [m²]
+    velocity_variance: frames.Vector = UNKNOWN_VARIANCE  # (3,) [m²/s²]
+    orientation_variance: frames.Vector = UNKNOWN_VARIANCE  # (3,) roll, pitch, yaw [rad²]
     reset_counter: int = 0
     """Counter of resets; a change marks a jump of the estimate."""
     quality: int = 0
@@ -99,13 +98,13 @@ class FlowReading(NamedTuple):
     motion gives a positive flow about y, motion to the right a negative flow about x.
     """
 
-    flow: Vector
+    flow: frames.Vector
     """(2,) flow about the body's x and y axes [rad]."""
     interval_s: float
     """Integration time [s]; 0 = no measurement."""
     quality: int
     """Quality, 0 = invalid to 255 = best."""
-    turned: Vector
+    turned: frames.Vector
     """(3,) angle integrated by the flow sensor's gyro, FRD [rad]; NaN = no gyro."""
 
 
@@ -130,11 +129,11 @@ class SensorSample(NamedTuple):
     """Sensor values of one tick; slower sensors have None between their samples."""
 
     time_us: int
-    accel: Vector  # (3,) specific force FRD [m/s²], (0, 0, -9.81) at rest
-    gyro: Vector  # (3,) FRD [rad/s]
+    accel: frames.Vector  # (3,) specific force FRD [m/s²], (0, 0, -9.81) at rest
+    gyro: frames.Vector  # (3,) FRD [rad/s]
     temperature_c: float
     battery: BatterySample
-    mag: Vector | None = None  # (3,) FRD [gauss]
+    mag: frames.Vector | None = None  # (3,) FRD [gauss]
     pressure_hpa: float | None = None
     """Static pressure [hPa]."""
     gps: GpsFix | None = None
@@ -164,10 +163,10 @@ class TrueState(NamedTuple):
     """True state; hidden from the autopilot."""
 
     time_us: int
-    position: Vector  # (3,) NED [m]
-    velocity: Vector  # (3,) NED [m/s]
-    quaternion: Vector  # (4,) body -> NED
-    angular_velocity: Vector  # (3,) FRD [rad/s]
+    position: frames.Vector  # (3,) NED [m]
+    velocity: frames.Vector  # (3,) NED [m/s]
+    quaternion: frames.Vector  # (4,) body -> NED
+    angular_velocity: frames.Vector  # (3,) FRD [rad/s]
     power_w: float
     battery_remaining: float
 
@@ -215,7 +214,7 @@ class FirmwareLostError(Exception):
     """
 
 
-class FirmwareMissingError(UsageError):
+class FirmwareMissingError(errors.UsageError):
     """External firmware cannot be started, or never connected."""
 
 

@@ -7,9 +7,8 @@ import select
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from airl_mav.core import constants, scheduling
 from airl_mav.core.clock import Clock, SimClock, WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.scheduling import ask_for_short_slices
 
 MAX_LAG_US = 200_000
 """Maximum lag to catch up [µs]; a larger lag is skipped: a burst of ticks would outrun the
@@ -89,7 +88,7 @@ class WallPacing:
         with longer ones: waiting for a whole foreign slice delays a tick by more than its length.
         """
         ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
-        ask_for_short_slices()
+        scheduling.ask_for_short_slices()
         self.clock = WallClock(speed)
         self.slipped_us = 0
         self._stamp_us = 0
@@ -117,7 +116,7 @@ class WallPacing:
         during the wait must not stamp data with a time that is about to be skipped.
         """
         clock = self.clock
-        wall_s = 1.0 / (clock.speed * US_PER_S)
+        wall_s = 1.0 / (clock.speed * constants.US_PER_S)
         now_us, woken = clock.time_us(), 0
         while now_us < tick_us:
             # A flood of data must not take the processor time that the companion needs.

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.frame import Frame
-from airl_mav.camera.render import Motion
+from airl_mav.camera import frame, render
 from airl_mav.core import constants
 from airl_mav.core.clock import Clock
 from airl_mav.core.frames import Geodetic
@@ -376,7 +375,7 @@ class Simulation:
         return math.inf if self._camera is None else self._camera.next_us
 
     def capture_due(
-        self, until_us: int, publish: Callable[[Frame], None], read_us: int = 0
+        self, until_us: int, publish: Callable[[frame.Frame], None], read_us: int = 0
     ) -> None:
         """Publish the frames that are due by simulated `until_us` [µs], now or in the newest ticks.
 
@@ -392,7 +391,7 @@ class Simulation:
                 time_us, row = truths["time_us"].item(k), truths["motion"][k].copy()
                 if time_us > until_us:
                     break
-            motion = Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])
+            motion = render.Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])
             camera.offer(time_us, motion, publish)
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -13,19 +13,16 @@ import numpy as np
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.control.demand import AttitudeDemand, Gains, RateDemand, TrajectoryDemand
-from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.core import clock, constants
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
-from firmware_sim.autopilot.climb import Climb
+from firmware_sim.autopilot import climb, yaw_estimator
 from firmware_sim.autopilot.estimator import aiding
 from firmware_sim.autopilot.failsafes.watch import is_calm
-from firmware_sim.autopilot.yaw_estimator import YawEstimator
+from firmware_sim.engine import record, ticks
 from firmware_sim.engine.controller import Controller
-from firmware_sim.engine.record import FLOWN_TICK, RISING, new_controller
-from firmware_sim.engine.ticks import detect_record
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.px4_links import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -42,7 +39,7 @@ ARMED_TICKS = 60
 HIGH_M = 20.0
 """Altitude above all obstacles [m]."""
 
-HOVER = np.array([0.0, 0.0, -GRAVITY_M_S2])
+HOVER = np.array([0.0, 0.0, -constants.GRAVITY_M_S2])
 """Specific force (3,) in level hover, FRD [m/s²]."""
 
 
@@ -66,7 +63,7 @@ def compile_others(vehicle: str) -> None:
     profile = VehicleProfile.model_validate_json(vehicle)
     # First what the ticks of the other process need: it finds it in the cache.
     none = np.zeros(1, np.int64)
-    flown, context = np.zeros(1, FLOWN_TICK), np.zeros(TickContext.SIZE)
+    flown, context = np.zeros(1, record.FLOWN_TICK), np.zeros(TickContext.SIZE)
     Packer().pack(flown, 0, context, none, none.copy(), none.copy(), 1, 0, 1)
     _fuse_in_the_air()
     aiding().warm_up(builtin_autopilot(EpisodeSetup(profile, None, 0)).parameters.value)
@@ -83,7 +80,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
     autopilot = builtin_autopilot(setup)
     if (origin := vehicle.told_origin) is not None:
         autopilot.set_origin(origin)  # required for the take-off
-    simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
+    simulation = Simulation(setup, start_us=0, clock=clock.SimClock(), autopilot=autopilot)
     links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]
     server = MavlinkServer(links, autopilot, boot_unix_us=0)
     try:
@@ -105,9 +102,9 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
         simulation.close()
     _fly_every_kind(autopilot.parameters.value)
     _fuse_in_the_air()
-    detect_record(autopilot.record)
+    ticks.detect_record(autopilot.record)
     is_calm(autopilot.record, np.zeros(6))
-    Climb(autopilot.record).fly(RISING, 0)
+    climb.Climb(autopilot.record).fly(record.RISING, 0)
     aiding().warm_up(autopilot.parameters.value)
 
 
@@ -124,6 +121,6 @@ def _fly_every_kind(value: Callable[[str], float]) -> None:
 
 def _fuse_in_the_air() -> None:
     """Fuse a velocity in flight into the yaw estimator; a real climb takes ten times as long."""
-    estimator = YawEstimator(new_controller())
+    estimator = yaw_estimator.YawEstimator(record.new_controller())
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)

@@ -13,7 +13,7 @@ import argparse
 import contextlib
 import io
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,7 +55,7 @@ class Entry:
     description: str
     facts: str
     commands: tuple[str, ...]
-    pictures: dict[str, Callable[[Path], None]]
+    pictures: Mapping[str, Callable[[Path], None]]
     """Functions that write the pictures, by file name."""
 
 
@@ -202,6 +202,7 @@ def draw_gap(path: Path) -> None:
         if arena is not None and not ax.patches:
             draw_arena(arena, ax, goal_radius_m=episode.goal_radius_m)
         quality = episode.quality
+        assert quality is not None
         label = f"{name}: {quality.distance_m:.0f} m, {quality.flight_time_s:.1f} s"
         ax.plot(trajectory.position[:, 1], trajectory.position[:, 0], color=colour, label=label)
     theme.plain_axes(ax, grid=False)

@@ -21,10 +21,8 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Ground, Shape, Tour
-from airl_mav.arena.walls import over_doors, over_openings
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.files import replace_file
+from airl_mav.arena import geometry, walls
+from airl_mav.core import constants, files
 
 FLOOR_COLOUR = "#f8f7f4"
 GRID_COLOUR = "#e4e1da"
@@ -47,7 +45,7 @@ ARROW_S = 2.0
 
 
 def draw_arena(
-    arena: Arena,
+    arena: geometry.Arena,
     ax: Axes,
     time_us: int = 0,
     *,
@@ -83,7 +81,7 @@ def add_legend(figure: Figure, ax: Axes) -> None:
 
 
 def save_png(
-    arena: Arena,
+    arena: geometry.Arena,
     path: Path,
     *,
     time_us: int = 0,
@@ -98,7 +96,7 @@ def save_png(
     figure = Figure(figsize=(max(width, 4.2), 1.3 + 0.88 * width * tall), layout="constrained")
     ax = figure.add_subplot()
     draw_arena(arena, ax, time_us, goal_radius_m=goal_radius_m, zone_radii_m=zone_radii_m)
-    when = f", t = {time_us / US_PER_S:g} s" if arena.tours else ""
+    when = f", t = {time_us / constants.US_PER_S:g} s" if arena.tours else ""
     ax.set_title(
         f"{arena.name}, seed {arena.seed}{when}", fontsize=11, color=TEXT_COLOUR, loc="left", pad=8
     )
@@ -111,10 +109,10 @@ def write_png(figure: Figure, path: Path, dpi: int = 150) -> None:
     picture = io.BytesIO()
     FigureCanvasAgg(figure)
     figure.savefig(picture, format="png", dpi=dpi)
-    replace_file(path, picture.getvalue())
+    files.replace_file(path, picture.getvalue())
 
 
-def _draw_floor(arena: Arena, ax: Axes) -> None:
+def _draw_floor(arena: geometry.Arena, ax: Axes) -> None:
     b = arena.bounds
     length, width = b.north_max - b.north_min, b.east_max - b.east_min
     thick = WALL_SHARE * max(length, width)
@@ -142,7 +140,7 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
         spine.set_visible(False)
 
 
-def _draw_ground(ground: Ground, ax: Axes) -> None:
+def _draw_ground(ground: geometry.Ground, ax: Axes) -> None:
     rows, columns = ground.heights.shape
     north = ground.south + ground.step_north * np.arange(rows)
     east = ground.west + ground.step_east * np.arange(columns)
@@ -158,7 +156,7 @@ def _draw_ground(ground: Ground, ax: Axes) -> None:
     ax.plot([], [], color=CONTOUR_COLOUR, lw=1.2, label=label)
 
 
-def _floor(arena: Arena) -> tuple[tuple[float, float], float, float]:
+def _floor(arena: geometry.Arena) -> tuple[tuple[float, float], float, float]:
     """Return the floor as matplotlib takes a rectangle: corner (east, north), width, height."""
     b = arena.bounds
     return (b.east_min, b.north_min), b.east_max - b.east_min, b.north_max - b.north_min
@@ -170,7 +168,7 @@ def _round_step(target: float) -> float:
     return next(power * m for m in (1.0, 2.0, 5.0, 10.0) if power * m >= target)
 
 
-def _draw_zones(arena: Arena, ax: Axes, radii_m: Sequence[float]) -> None:
+def _draw_zones(arena: geometry.Arena, ax: Axes, radii_m: Sequence[float]) -> None:
     """Draw zone limits, clipped at the walls, labelled as near to due north as fits."""
     floor = Rectangle(*_floor(arena), transform=ax.transData)
     for k, radius in enumerate(radii_m):
@@ -196,7 +194,7 @@ def _draw_zones(arena: Arena, ax: Axes, radii_m: Sequence[float]) -> None:
             )
 
 
-def _holds(arena: Arena, radius: float, bearing_deg: int) -> bool:
+def _holds(arena: geometry.Arena, radius: float, bearing_deg: int) -> bool:
     """Return whether a label fits on the floor at a distance and bearing from the start."""
     b = arena.bounds
     north = radius * math.cos(math.radians(bearing_deg))
@@ -206,11 +204,11 @@ def _holds(arena: Arena, radius: float, bearing_deg: int) -> bool:
     return inside_north and b.east_min + room < east < b.east_max - room
 
 
-def _draw_obstacles(arena: Arena, ax: Axes, time_us: int) -> None:
+def _draw_obstacles(arena: geometry.Arena, ax: Axes, time_us: int) -> None:
     centers = arena.centers_at(time_us)
     labelled: set[bool | str] = set()
     open_way = np.zeros(len(arena.obstacles), np.bool_)
-    open_way[: arena.n_static] = over_openings(arena) | over_doors(arena)
+    open_way[: arena.n_static] = walls.over_openings(arena) | walls.over_doors(arena)
     for i in range(len(arena.obstacles)):
         if open_way[i]:
             patch = _footprint(arena, i, centers[i])
@@ -228,16 +226,16 @@ def _draw_obstacles(arena: Arena, ax: Axes, time_us: int) -> None:
             patch.set_label("moving obstacle" if moves else "static obstacle")
             labelled.add(moves)
         ax.add_patch(patch)
-        if arena.obstacles.shape[i] == Shape.SPHERE:
+        if arena.obstacles.shape[i] == geometry.Shape.SPHERE:
             radius = 0.62 * arena.obstacles.half_size[i, 0]
             ring: dict[str, Any] = {"edgecolor": "white", "alpha": 0.6, "lw": 0.9, "zorder": 2.2}
             ax.add_patch(Circle((centers[i, 1], centers[i, 0]), radius, fill=False, **ring))
 
 
-def _footprint(arena: Arena, i: int, center: NDArray[np.float64]) -> Patch:
+def _footprint(arena: geometry.Arena, i: int, center: NDArray[np.float64]) -> Patch:
     """Return the outline of an obstacle, seen from above, at `center` (3,) NED [m]."""
     along, across = arena.obstacles.half_size[i, :2]
-    if arena.obstacles.shape[i] != Shape.BOX:
+    if arena.obstacles.shape[i] != geometry.Shape.BOX:
         return Circle((center[1], center[0]), along)
     yaw = float(arena.obstacles.yaw[i])
     first = np.array([math.cos(yaw), math.sin(yaw)]) * along
@@ -246,9 +244,9 @@ def _footprint(arena: Arena, i: int, center: NDArray[np.float64]) -> Patch:
     return Polygon((center[:2] + corners)[:, ::-1], closed=True)
 
 
-def _draw_arrow(ax: Axes, center: NDArray[np.float64], tour: Tour, time_us: int) -> None:
+def _draw_arrow(ax: Axes, center: NDArray[np.float64], tour: geometry.Tour, time_us: int) -> None:
     """Draw the motion of an obstacle over ARROW_S as an arrow."""
-    t = (time_us / US_PER_S) % tour.times_s[-1]
+    t = (time_us / constants.US_PER_S) % tour.times_s[-1]
     k = int(np.searchsorted(tour.times_s, t, side="right")) - 1
     step = np.diff(tour.points, axis=0)
     # During a stop the arrow shows the next leg.
@@ -270,7 +268,7 @@ def _draw_arrow(ax: Axes, center: NDArray[np.float64], tour: Tour, time_us: int)
     )
 
 
-def _draw_start_and_goal(arena: Arena, ax: Axes, goal_radius_m: float | None) -> None:
+def _draw_start_and_goal(arena: geometry.Arena, ax: Axes, goal_radius_m: float | None) -> None:
     north, east = arena.goal
     if goal_radius_m is not None:
         disc = Circle((east, north), goal_radius_m, edgecolor=GOAL_COLOUR, lw=1.0, zorder=1.5)

@@ -25,8 +25,7 @@ from airl_mav.arena.walls import (
     with_gates,
     with_walls,
 )
-from airl_mav.core.errors import UsageError
-from airl_mav.core.streams import seeded
+from airl_mav.core import errors, streams
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.walls import HEADROOM_M
 
@@ -110,9 +109,9 @@ def generate(
     Raises UsageError with the reason if an argument is invalid or LAYOUTS layouts failed.
     """
     if seed < 0:
-        raise UsageError(f"seed = {seed}: accepted: value >= 0")
+        raise errors.UsageError(f"seed = {seed}: accepted: value >= 0")
     if not vehicle_width_m > 0.0:
-        raise UsageError(f"vehicle_width_m = {vehicle_width_m:g}: accepted: value > 0 m")
+        raise errors.UsageError(f"vehicle_width_m = {vehicle_width_m:g}: accepted: value > 0 m")
     if spec.generator != OBSTACLES:
         return generate_own(spec, seed, name=name, vehicle_width_m=vehicle_width_m, zone=zone)
     openings = draw_openings(_rng(seed, _Stream.GATES), spec)
@@ -163,7 +162,7 @@ def generate(
             building=request.building,
             ground=request.ground,
         )
-    raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
+    raise errors.UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
 
 def local_bounds(spec: ArenaSpec) -> geometry.Bounds:
@@ -188,7 +187,7 @@ def free_area_fraction(arena: geometry.Arena) -> float:
 
 
 def _rng(seed: int, stream: _Stream) -> np.random.Generator:
-    return seeded(seed, stream)
+    return streams.seeded(seed, stream)
 
 
 def _draw_counts(spec: ArenaSpec, seed: int) -> tuple[int, int]:
@@ -206,7 +205,7 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
     if fixed is None or zone is None:
         return
     if (distance := float(np.hypot(*fixed))) > radius:
-        raise UsageError(
+        raise errors.UsageError(
             f"goal.north_m = {fixed[0]:g}, goal.east_m = {fixed[1]:g}: fixed {distance:.1f} m from "
             f"the start; accepted: value <= {radius:g} m in zone {zone}"
         )
@@ -221,7 +220,7 @@ def _draw_rooms(
     # The passage search works on a raster, so a door needs more than the vehicle's width.
     least = placement.least_gap_m(bounds, vehicle_width_m)
     if spec.rooms.door_width_m[0] < least:
-        raise UsageError(
+        raise errors.UsageError(
             f"arena {name!r}: rooms.door_width_m = {list(spec.rooms.door_width_m)}: accepted: value"
             f" >= {least:.2f} m, so that a vehicle {vehicle_width_m:g} m wide finds its way through"
         )
@@ -238,7 +237,7 @@ def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: f
         return
     least = 2.0 * float(openings.half_size[:, 1:].min())
     if least <= vehicle_width_m:
-        raise UsageError(
+        raise errors.UsageError(
             f"arena {name!r}, seed {seed}: an opening of a gate is {least:.2f} m wide or high "
             f"(gates.width_m, gates.height_m); accepted: more than the vehicle's "
             f"{vehicle_width_m:g} m"

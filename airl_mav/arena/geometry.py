@@ -21,8 +21,7 @@ from airl_mav.core.addons import entries, load, load_entry
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.frames import Goal
-from airl_mav.profiles.arena import DEFAULT_APPEARANCE, Appearance
-from airl_mav.profiles.assets import MeshFile
+from airl_mav.profiles import arena, assets
 
 Floats = NDArray[np.float64]
 
@@ -142,7 +141,6 @@ class Ground:
         return heights
 
 
-Floats = NDArray[np.float64]
 Numbers = Annotated[Floats, ArrayField(np.float64)]
 Points = Annotated[Floats, ArrayField(np.float64, 3)]
 
@@ -199,7 +197,7 @@ class Obstacles:
 class PlacedMesh:
     """A mesh that cameras render in place of obstacles; collisions use the obstacles."""
 
-    file: MeshFile
+    file: assets.MeshFile
     """Triangles: forward, right and down from the mesh's position."""
     place: tuple[float, float]
     """Position of the origin on the floor: north, east [m]."""
@@ -248,7 +246,7 @@ class Arena:
     """All obstacles; the last `len(tours)` of them move."""
     tours: tuple[Tour, ...]
     goal: Numbers  # (2,) north, east [m] from the start
-    appearance: Appearance = DEFAULT_APPEARANCE
+    appearance: arena.Appearance = arena.DEFAULT_APPEARANCE
     """Distribution of the appearance. Geometry is independent of it, and depth except for glass."""
     statics: Statics | None = None
     """Groups of static primitives; None = every primitive is separate."""

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import PlacedMesh
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.assets import GREATEST_M, MOST_TRIANGLES, MeshFile
-from airl_mav.profiles.loading import read_checked
+from airl_mav.profiles import assets, loading
 
 KEPT = 16
 """Meshes cached in a process."""
@@ -46,9 +45,9 @@ class Triangles:
 
 
 @lru_cache(maxsize=KEPT)
-def triangles_of(file: MeshFile) -> Triangles:
+def triangles_of(file: assets.MeshFile) -> Triangles:
     """Return the triangles of a file, cached; UsageError if it is missing or changed."""
-    return decoded(read_checked(file), file.file)
+    return decoded(loading.read_checked(file), file.file)
 
 
 def standing(placed: PlacedMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -103,12 +102,12 @@ def _problem(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> str | N
     for name, array, kind in (("vertices", vertices, np.float32), ("faces", faces, np.int32)):
         if array.dtype != kind or array.ndim != 2 or array.shape[1] != 3:
             return f"{name} {array.dtype} {array.shape}: accepted: {np.dtype(kind)} (n, 3)"
-    if not 1 <= len(faces) <= MOST_TRIANGLES:
-        return f"{len(faces):,} triangles: accepted: 1 to {MOST_TRIANGLES:,}"
+    if not 1 <= len(faces) <= assets.MOST_TRIANGLES:
+        return f"{len(faces):,} triangles: accepted: 1 to {assets.MOST_TRIANGLES:,}"
     if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
         return f"faces: accepted: numbers of its {len(vertices):,} vertices"
-    if not (np.abs(vertices) <= GREATEST_M).all():  # also rejects NaN
-        return f"vertices: accepted: places within {GREATEST_M:g} m of the asset's"
+    if not (np.abs(vertices) <= assets.GREATEST_M).all():  # also rejects NaN
+        return f"vertices: accepted: places within {assets.GREATEST_M:g} m of the asset's"
     if not areas(vertices[faces]).any():
         return "faces: accepted: triangles, at least one of which has an area"
     return None

@@ -19,8 +19,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from pydantic import TypeAdapter, ValidationError
 
 from airl_mav.black_box.messages import JSON, TOPICS, Channel, Message, encoded
-from airl_mav.core.clock import NS_PER_US
-from airl_mav.core.errors import UsageError
+from airl_mav.core import clock, errors
 
 METADATA = "airl-mav"
 """Name of the metadata record that describes the run."""
@@ -55,7 +54,7 @@ class McapFile:
         if channel not in self._channels:
             self._channels[channel] = self._register(channel)
         self._sequence += 1
-        time_ns = unix_us * NS_PER_US
+        time_ns = unix_us * clock.NS_PER_US
         self._writer.add_message(self._channels[channel], time_ns, data, time_ns, self._sequence)
 
     def _register(self, channel: Channel) -> int:
@@ -138,11 +137,11 @@ def read_black_box(path: Path) -> BlackBox:
                     kind, message = record
                     box.messages.setdefault(kind, []).append(message)
     except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
+        raise errors.UsageError(f"{path}: {error.strerror}") from None
     except (InvalidMagic, KeyError, TypeError, ValueError):
         box = None
     if box is None:
-        raise UsageError(f"{path}: accepted: a black box of airl-companion (MCAP)")
+        raise errors.UsageError(f"{path}: accepted: a black box of airl-companion (MCAP)")
     return box
 
 

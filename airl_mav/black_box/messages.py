@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
-from airl_mav.core.clock import NS_PER_US
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core import clock, constants
 
 SUFFIX = ".mcap"
 
@@ -250,8 +249,8 @@ def text(message: str, name: str, unix_us: int, level: int = INFO) -> Log:
 
 def time_of(unix_us: int) -> Timestamp:
     """Convert a calendar time [µs since 1970] to Foxglove's schema."""
-    seconds, rest_us = divmod(unix_us, US_PER_S)
-    return Timestamp(seconds, rest_us * NS_PER_US)
+    seconds, rest_us = divmod(unix_us, constants.US_PER_S)
+    return Timestamp(seconds, rest_us * clock.NS_PER_US)
 
 
 UNKNOWN = "null: not known"

@@ -17,10 +17,7 @@ from airl_mav.arena.geometry import STEEPEST, Arena, Shape, Tour
 from airl_mav.arena.placement import Floats, zone_of
 from airl_mav.arena.walls import openings_of
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.progress import new_console
+from airl_mav.core import constants, errors, fields, progress
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -97,7 +94,7 @@ def _speed_m_s(tour: Tour) -> float:
     return float(length[moves].sum() / np.diff(tour.times_s)[moves].sum())
 
 
-class ArenaOptions(ProfileModel):
+class ArenaOptions(fields.ProfileModel):
     """Generate an arena, list its contents, draw a top view.
 
     Examples:
@@ -106,10 +103,10 @@ class ArenaOptions(ProfileModel):
     """
 
     name: Annotated[ArenaName, POSITIONAL] = DEFAULT_ARENA
-    seed: int | None = quantity(
+    seed: int | None = fields.quantity(
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )
-    zone: int | None = quantity(
+    zone: int | None = fields.quantity(
         "curriculum zone that bounds the goal, 0 is the nearest; by default the largest",
         "1",
         ge=0,
@@ -117,21 +114,21 @@ class ArenaOptions(ProfileModel):
         default=None,
     )
     png: Path | None = Field(default=None, description="write a picture to this .png file")
-    time_s: float = quantity(
+    time_s: float = fields.quantity(
         "when the picture shows the moving obstacles, after the start",
         "s",
         ge=0,
         le=1e6,
         default=0.0,
     )
-    vehicle_width_m: float = quantity(
+    vehicle_width_m: float = fields.quantity(
         "width of the vehicle: the way from start to goal is at least this wide",
         "m",
         gt=0,
         le=100,
         default=0.55,
     )
-    goal_radius_m: float = quantity(
+    goal_radius_m: float = fields.quantity(
         "radius of the disc around the goal in the picture",
         "m",
         gt=0,
@@ -145,9 +142,9 @@ OPTIONS = ArenaOptions
 
 def run(options: ArenaOptions, console: Console | None = None) -> int:
     """Print the arena's table and write its picture; return 0."""
-    console = console or new_console()
+    console = console or progress.new_console()
     if options.png is not None and options.png.suffix.lower() != ".png":
-        raise FieldError("png", f"{options.png}", "a file name that ends in .png")
+        raise errors.FieldError("png", f"{options.png}", "a file name that ends in .png")
     spec = load_profile("arenas", options.name, ArenaSpec)
     arena = generate(
         spec,
@@ -165,12 +162,12 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
             save_png(
                 arena,
                 options.png,
-                time_us=round(options.time_s * US_PER_S),
+                time_us=round(options.time_s * constants.US_PER_S),
                 goal_radius_m=options.goal_radius_m,
                 zone_radii_m=spec.zones_m,
             )
         except OSError as error:
             problem = f"cannot write: {error.strerror}"
-            raise FieldError("png", f"{options.png}", problem=problem) from None
+            raise errors.FieldError("png", f"{options.png}", problem=problem) from None
         console.print(f"picture: {options.png}", soft_wrap=True, highlight=False)
     return 0

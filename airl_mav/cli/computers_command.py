@@ -11,10 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.fields import ProfileModel
-from airl_mav.core.progress import new_console
-from airl_mav.profiles.computer import LatencyDistribution, Workload, load_computer
-from airl_mav.profiles.loading import list_profiles
+from airl_mav.core import fields, progress
+from airl_mav.profiles import computer, loading
 
 SAYS = (
     "measured: samples of that machine, replayed in their order. published: mean and spread that"
@@ -23,7 +21,7 @@ SAYS = (
 )
 
 
-class ComputersOptions(ProfileModel):
+class ComputersOptions(fields.ProfileModel):
     """List computer profiles with the latency, origin and source of their workloads.
 
     Examples:
@@ -42,8 +40,8 @@ OPTIONS = ComputersOptions
 
 def run(options: ComputersOptions, console: Console | None = None) -> int:
     """Print the table. Returns exit status 0; raises UsageError for an invalid profile."""
-    console = console or new_console()
-    names = options.profiles or tuple(list_profiles("computers"))
+    console = console or progress.new_console()
+    names = options.profiles or tuple(loading.list_profiles("computers"))
     console.print(_table(names))
     console.print(SAYS, highlight=False)
     return 0
@@ -56,7 +54,7 @@ def _table(names: Sequence[str]) -> Table:
     table.add_column("t2, mean ms", justify="right")
     table.add_column("source", overflow="fold")
     for name in names:
-        profile = load_computer(name)
+        profile = computer.load_computer(name)
         table.add_row(name, "", "", "", f"{profile.cpu}; {profile.watts:g} W", style="dim")
         for key, work in profile.workloads.items():
             mean_ms = f"{_mean_ms(work.latency):.3g}"
@@ -64,13 +62,13 @@ def _table(names: Sequence[str]) -> Table:
     return table
 
 
-def _mean_ms(latency: LatencyDistribution) -> float:
+def _mean_ms(latency: computer.LatencyDistribution) -> float:
     if latency.samples_ms is not None:
         return float(np.mean(latency.samples_ms))
     return latency.mean_ms or 0.0
 
 
-def _source(work: Workload) -> str:
+def _source(work: computer.Workload) -> str:
     how = work.measured
     if how is None:
         return work.source

@@ -12,8 +12,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.cli.shared_options import Gate, Viewing, Voice, leave, requirements_of, view_of
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import COMMON
+from airl_mav.core import errors, fields
 
 if TYPE_CHECKING:
     from airl_mav.experiments.live import FlownRun
@@ -38,7 +37,7 @@ class EvaluateOptions(Gate, Viewing, ExperimentOptions):
     policies: Annotated[tuple[str, ...], POSITIONAL] = Field(
         default=(), description="names, or paths to folders with policy.onnx and card.json"
     )
-    arena: Annotated[tuple[str, ...], COMMON, "arena"] = Field(
+    arena: Annotated[tuple[str, ...], fields.COMMON, "arena"] = Field(
         default=(),
         description="arena profiles: shipped names, or paths to .toml files; by default those that"
         " the policies were trained in, or static-obstacles",
@@ -49,12 +48,12 @@ class EvaluateOptions(Gate, Viewing, ExperimentOptions):
         description="fly every policy healthy and with each fault alone, a row each, instead of"
         " with all of them at once",
     )
-    on_card: Annotated[bool, COMMON, "output"] = Field(
+    on_card: Annotated[bool, fields.COMMON, "output"] = Field(
         default=False,
         description="write the results onto the policies' cards, in place of earlier ones of the"
         " same arena, level and latency",
     )
-    out: Annotated[Path | None, COMMON, "output"] = Field(
+    out: Annotated[Path | None, fields.COMMON, "output"] = Field(
         default=None,
         description="run folder, or with several policies or arenas the folder of their run"
         " folders; by default runs/<UTC time>-...",
@@ -82,7 +81,7 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
     cells = evaluation_cells(scenario, options.policies, options.arena, each_fault=each_fault)
     view = view_of(options)
     if view is not None and (len(cells) > 1 or options.level == "gym"):
-        raise FieldError(
+        raise errors.FieldError(
             "view",
             True,
             problem="accepted: with one policy in one arena, at level lockstep or sitl",

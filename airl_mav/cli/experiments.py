@@ -10,8 +10,7 @@ from rich.console import Console
 
 from airl_mav.cli.shared_options import Gate, Telling, Voice, leave, requirements_of
 from airl_mav.core.fields import COMMON, quantity
-from airl_mav.scenario import model
-from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.scenario import aircraft, model
 
 if TYPE_CHECKING:
     from airl_mav.experiments.experiment import Experiment, ExperimentRun
@@ -28,7 +27,7 @@ def episodes(description: str, default: int, least: int = 1) -> Any:
     return quantity(description, "1", ge=least, le=model.GREATEST_EPISODES, default=default)
 
 
-class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions, Aircraft):
+class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions, aircraft.Aircraft):
     """Options of all experiments; the default level is the fastest."""
 
     level: model.LevelName = Field(

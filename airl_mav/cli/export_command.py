@@ -16,9 +16,8 @@ from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.addons import load_entry
 from airl_mav.core.errors import FieldError
 from airl_mav.core.progress import new_console
+from airl_mav.policy import card_writing, registry
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
-from airl_mav.policy.card_writing import copy_policy
-from airl_mav.policy.registry import find_policy
 from airl_mav.training.export_request import FLOWN, ExportRequest
 
 
@@ -97,14 +96,14 @@ def _copy(options: ExportOptions) -> PolicyCard:
     if other := sorted(given.keys() - {"model", "out", "name", *CHANGED}):
         accepted = ", ".join(CHANGED)
         raise FieldError(other[0], given[other[0]], f"of a policy that is there: {accepted}")
-    return copy_policy(
+    return card_writing.copy_policy(
         _policy_folder(options), options.out, changes | {"name": options.policy_name}
     )
 
 
 def _policy_folder(options: ExportOptions) -> Path:
     """Return the folder of the learned policy given as the model. Raises UsageError."""
-    found = find_policy(options.model)
+    found = registry.find_policy(options.model)
     if found.folder is None:
         raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
     return found.folder

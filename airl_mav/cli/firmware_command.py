@@ -14,16 +14,14 @@ from airl_mav.core.first_start import compile_shown
 from airl_mav.core.frames import Goal
 from airl_mav.core.progress import new_console
 from airl_mav.lockstep.turns import LockstepError
-from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles import arena, loading
 from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, fly_vehicle
-from airl_mav.scenario.resolve import FIRMWARE_TITLES, flight_plan
-from airl_mav.scenario.stand_alone import StandAloneVehicle
+from airl_mav.scenario import resolve, stand_alone
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.interfaces import FirmwareLostError
 
 
-class FirmwareOptions(StandAloneVehicle):
+class FirmwareOptions(stand_alone.StandAloneVehicle):
     """Run the flight controller with its vehicle, until Ctrl-C.
 
     Examples:
@@ -41,8 +39,8 @@ def run(options: FirmwareOptions, console: Console | None = None) -> int:
     """Fly until Ctrl-C or, in lockstep, the companion's end; return 1 for a lost connection."""
     console = console or new_console(soft_wrap=True)
     vehicle, _ = aircraft_of(options)
-    load_profile("arenas", options.arena, ArenaSpec)  # refused before kernels compile
-    compile_shown([flight_plan(vehicle, options.plant)])
+    loading.load_profile("arenas", options.arena, arena.ArenaSpec)  # refused before kernels compile
+    compile_shown([resolve.flight_plan(vehicle, options.plant)])
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -73,7 +71,7 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
                 )
         say(f"depth camera      {camera}")
         if options.firmware != "builtin":
-            say(f"firmware          {FIRMWARE_TITLES[options.firmware]}")
+            say(f"firmware          {resolve.FIRMWARE_TITLES[options.firmware]}")
         # In lockstep all digits matter.
         metres = " ".join(repr(m) if options.lockstep else f"{m:.1f}" for m in goal)
         say(f"goal              {metres} (north east{' down' if len(goal) == 3 else ''}, m)")

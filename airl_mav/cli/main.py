@@ -11,9 +11,7 @@ from typing import NoReturn
 from rich.console import Console
 
 from airl_mav import __version__
-from airl_mav.core.addons import entries
-from airl_mav.core.errors import EXIT_USAGE, refer
-from airl_mav.core.progress import new_console
+from airl_mav.core import addons, errors, progress
 
 GROUPS = {
     "fly": "Fly",
@@ -53,16 +51,16 @@ def subcommands() -> dict[str, tuple[str, str, str]]:
         name: (group, purpose, f"airl_mav.cli.{name.replace('-', '_')}_command")
         for name, (group, purpose) in SUBCOMMANDS.items()
     }
-    return core | entries("airl_mav", "COMMANDS")
+    return core | addons.entries("airl_mav", "COMMANDS")
 
 
 def main(words: Sequence[str] | None = None) -> NoReturn:
     """Run a subcommand and exit with its status."""
     words = sys.argv[1:] if words is None else words
-    console = new_console(soft_wrap=True)
+    console = progress.new_console(soft_wrap=True)
     if not words or words[0] in ("-h", "--help"):
         _print_help(console)
-        sys.exit(0 if words else EXIT_USAGE)
+        sys.exit(0 if words else errors.EXIT_USAGE)
     name, *rest = words
     if name == "--version":
         console.print(f"airl-mav {__version__}", highlight=False)
@@ -71,11 +69,11 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"accepted: {', '.join(known)}"
-        hint = refer([name]) or hint
-        new_console(stderr=True, soft_wrap=True).print(
+        hint = errors.refer([name]) or hint
+        progress.new_console(stderr=True, soft_wrap=True).print(
             f"error: airl {name}: no such command; {hint}", style="red"
         )
-        sys.exit(EXIT_USAGE)
+        sys.exit(errors.EXIT_USAGE)
     _run(f"airl {name}", known[name][2], rest)
 
 

@@ -23,11 +23,9 @@ import tyro
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from airl_mav.core import errors
+from airl_mav.core import errors, first_start, progress
 from airl_mav.core.errors import refer
 from airl_mav.core.fields import range_of, validated
-from airl_mav.core.first_start import shown_by
-from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults import Fault
 from airl_mav.profiles.loading import read_toml
 from airl_mav.scenario.aircraft import IN_WORDS
@@ -273,7 +271,7 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     check_installed(*getattr(command, "EXTRAS", ()))
     try:
         # On standard error, as programs read standard output.
-        with shown_by(lambda: RichProgress(new_console(stderr=True))):
+        with first_start.shown_by(lambda: progress.RichProgress(progress.new_console(stderr=True))):
             return int(command.run(options, **more))
     except errors.FieldError as error:
         options_model = type(options)
@@ -289,7 +287,7 @@ def _thread_failed(failed: threading.ExceptHookArgs) -> None:
 
 
 def _fail(message: str) -> None:
-    new_console(stderr=True, soft_wrap=True).print(f"error: {message}", style="red")
+    progress.new_console(stderr=True, soft_wrap=True).print(f"error: {message}", style="red")
 
 
 EXTRAS = {

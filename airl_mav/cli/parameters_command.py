@@ -9,15 +9,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel
-from airl_mav.core.files import replace_file
+from airl_mav.core import errors, fields, files
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
 from firmware_sim.external.programs import firmware_kind
 
 
-class ParametersOptions(ProfileModel):
+class ParametersOptions(fields.ProfileModel):
     """Write the parameters that real firmware needs to fly a vehicle, for firmware that you start.
 
     For PX4, the file is for QGroundControl; for ArduPilot, for the option --defaults. airl-sitl
@@ -47,6 +45,6 @@ def run(options: ParametersOptions) -> int:
         sys.stdout.write(text)
         return 0
     if not options.out.parent.is_dir():
-        raise FieldError("out", f"{options.out}", problem=f"no folder {options.out.parent}")
-    replace_file(options.out, text.encode())
+        raise errors.FieldError("out", f"{options.out}", problem=f"no folder {options.out.parent}")
+    files.replace_file(options.out, text.encode())
     return 0

@@ -11,15 +11,12 @@ from rich.console import Console
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.shared_options import TrustArenas, folder_of
-from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel
-from airl_mav.core.progress import new_console
+from airl_mav.core import clock, errors, fields, progress
 from airl_mav.rehearsal.run_folder import RUN_FILE, load, trust_arenas
 from airl_mav.report.comparison.comparison_model import comparison_file, kind_of
 
 
-class ReportOptions(ProfileModel):
+class ReportOptions(fields.ProfileModel):
     """Print the tables of a run or a comparison and rewrite its page; or compare runs.
 
     Two or more runs are compared: settings, quality of flight with intervals, paired differences on
@@ -61,12 +58,12 @@ OPTIONS = ReportOptions
 
 def run(options: ReportOptions, console: Console | None = None) -> int:
     """Build the report; return 0."""
-    console = console or new_console()
+    console = console or progress.new_console()
     if not options.runs:
-        raise FieldError("runs", accepted="one run folder or more")
+        raise errors.FieldError("runs", accepted="one run folder or more")
     recorded = [path for path in options.runs if path.suffix == SUFFIX and not path.is_dir()]
     if options.ulg is not None and len(recorded) != 1:
-        raise FieldError("ulg", f"{options.ulg}", "with one black box of a flight (.mcap)")
+        raise errors.FieldError("ulg", f"{options.ulg}", "with one black box of a flight (.mcap)")
     folders = [folder_of(path, options.ulg if path in recorded else None) for path in options.runs]
     options = options.model_copy(update={"runs": tuple(folders)})
     first = options.runs[0]
@@ -78,7 +75,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
         return _compare(options, console)
     for field, value in (("out", options.out), ("names", " ".join(options.names))):
         if value:
-            raise FieldError(field, f"{value}", "with two runs or more")
+            raise errors.FieldError(field, f"{value}", "with two runs or more")
     if kind_of(first) is None:
         # Imported here and below: options do not need the figures.
         from airl_mav.report import theme
@@ -98,12 +95,12 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
 def _compare(options: ReportOptions, console: Console) -> int:
     from airl_mav.report.comparison.show import compare_folders, show_comparison
 
-    out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
+    out = options.out or Path("runs") / f"{clock.utc_now():%Y%m%dT%H%M%SZ}-compare"
     if (out / RUN_FILE).exists():
-        raise FieldError("out", f"{out}", "another folder: it holds a run")
+        raise errors.FieldError("out", f"{out}", "another folder: it holds a run")
     held = comparison_file(out, "compare").exists()
     if out.is_dir() and any(out.iterdir()) and not held:
-        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
+        raise errors.FieldError("out", f"{out}", "a new or empty folder: it holds something else")
     comparison, runs = compare_folders(list(options.runs), options.names)
     show_comparison(comparison, runs, out, console)
     return 0

@@ -13,11 +13,7 @@ from rich.console import Console
 from airl_mav import __version__
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import REPEATED, check_installed
-from airl_mav.core.addons import entries, load
-from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import COMMON, ProfileModel, quantity
-from airl_mav.core.progress import Event, JsonProgress, Progress, RichProgress, new_console
+from airl_mav.core import addons, clock, errors, fields, progress
 from airl_mav.rehearsal.live_view import ViewRequest
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
@@ -34,11 +30,11 @@ TrustArenas = Annotated[
 ]
 
 
-class Gate(ProfileModel):
+class Gate(fields.ProfileModel):
     """Requirements, and files for the verdict."""
 
     GROUP: ClassVar[str] = "requirements"
-    require: Annotated[tuple[str, ...], REPEATED, COMMON] = Field(
+    require: Annotated[tuple[str, ...], REPEATED, fields.COMMON] = Field(
         default=(),
         description="requirement, decided on the 95 % interval, as 'success >= 95 %'; may be"
         " repeated. Exit status 3: not met, 5: too few flights to decide",
@@ -61,7 +57,7 @@ def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement,
     requirements = tuple(parse_requirement(text) for text in gate.require)
     for requirement in requirements:
         if requirement.gap and not reference:
-            raise FieldError(
+            raise errors.FieldError(
                 "require",
                 str(requirement),
                 f"a gap only with a reference, as in airl hardware-gap; {ACCEPTED}",
@@ -79,16 +75,16 @@ def leave(gate: Gate, verdict: OverallVerdict, suite: str) -> None:
         write_badge(verdict, gate.badge)
 
 
-class Viewing(ProfileModel):
+class Viewing(fields.ProfileModel):
     """Live view of flights."""
 
     GROUP: ClassVar[str] = "output"
-    view: Annotated[bool, COMMON] = Field(
+    view: Annotated[bool, fields.COMMON] = Field(
         default=False,
         description="show the flights in a browser while they fly, at an address that is printed"
         " (docs/how-to/view-and-export.md); in lockstep they fly in real time, or at --speed",
     )
-    view_port: int | None = quantity(
+    view_port: int | None = fields.quantity(
         "TCP port of that page on the loopback address; by default a free one",
         "1",
         ge=1,
@@ -101,12 +97,12 @@ def view_of(options: Viewing) -> ViewRequest | None:
     """Return the requested live view or None; UsageError for missing packages."""
     if not options.view:
         if options.view_port is not None:
-            raise FieldError(
+            raise errors.FieldError(
                 "view_port", options.view_port, problem="accepted: together with --view"
             )
         return None
-    if not entries("airl_mav", "VIEW"):
-        raise UsageError("--view: needs the add-on view (airl_mav/addons/view)")
+    if not addons.entries("airl_mav", "VIEW"):
+        raise errors.UsageError("--view: needs the add-on view (airl_mav/addons/view)")
     check_installed("view")
     return ViewRequest(options.view_port)
 
@@ -116,17 +112,17 @@ def folder_of(path: Path, ulg: Path | None = None) -> Path:
     if path.suffix != SUFFIX or path.is_dir():
         return path
     check_installed("black-box" if ulg is None else "identify")
-    converter = entries("airl_mav", "RECORDINGS").get(path.suffix)
+    converter = addons.entries("airl_mav", "RECORDINGS").get(path.suffix)
     if converter is None:
-        raise UsageError(f"{path}: needs the add-on recordings (airl_mav/addons/recordings)")
-    return Path(load(converter)(path, ulg))
+        raise errors.UsageError(f"{path}: needs the add-on recordings (airl_mav/addons/recordings)")
+    return Path(addons.load(converter)(path, ulg))
 
 
 SCHEMA = 1
 """Version of the JSON lines; docs/reference/json-lines.md describes them."""
 
 
-class Telling(ProfileModel):
+class Telling(fields.ProfileModel):
     """Output mode of a command."""
 
     GROUP: ClassVar[str] = "output"
@@ -143,7 +139,7 @@ class Telling(ProfileModel):
 
 
 @dataclass(frozen=True)
-class Started(Event):
+class Started(progress.Event):
     """Start of the command, after reading its input."""
 
     event: ClassVar[str] = "started"
@@ -176,7 +172,7 @@ class ToldRun:
 
 
 @dataclass(frozen=True)
-class Finished(Event):
+class Finished(progress.Event):
     """End of the command: always the last line, unless the input is invalid."""
 
     event: ClassVar[str] = "finished"
@@ -201,16 +197,16 @@ class Voice:
     def __init__(self, options: Telling, command: str, console: Console | None = None) -> None:
         """Prepare the output of a command; raise FieldError if both kinds are requested."""
         if options.quiet and options.json_lines:
-            raise FieldError("quiet", True, problem="accepted: without --json")
-        self._out = console or new_console()
-        self._json = JsonProgress(self._out.file) if options.json_lines else None
+            raise errors.FieldError("quiet", True, problem="accepted: without --json")
+        self._out = console or progress.new_console()
+        self._json = progress.JsonProgress(self._out.file) if options.json_lines else None
         self._quiet = options.quiet
         self._command = command
         silent = options.quiet or options.json_lines
-        self.console = new_console(quiet=True) if silent else self._out
+        self.console = progress.new_console(quiet=True) if silent else self._out
         """Console for text that only people read: remarks and tables."""
-        self._drawn = None if silent else RichProgress(self._out)
-        self.progress: Progress = self._drawn or self._json or _Errors()
+        self._drawn = None if silent else progress.RichProgress(self._out)
+        self.progress: progress.Progress = self._drawn or self._json or _Errors()
         """Receiver of progress reports."""
 
     def __enter__(self) -> Voice:
@@ -218,7 +214,7 @@ class Voice:
         if self._drawn is not None:
             self._drawn.__enter__()
         if self._json is not None:
-            now = utc_now().isoformat(timespec="seconds")
+            now = clock.utc_now().isoformat(timespec="seconds")
             self._json.tell(Started(SCHEMA, self._command, __version__, now))
         return self
 
@@ -272,10 +268,10 @@ def _told(name: str, run: LoadedRun) -> ToldRun:
     )
 
 
-class _Errors(Progress):
+class _Errors(progress.Progress):
     """Progress that prints only errors."""
 
     def note(self, text: str, style: str | None = None) -> None:
         """Print an error on standard error."""
         if style == "red":
-            new_console(stderr=True, soft_wrap=True).print(text, style=style)
+            progress.new_console(stderr=True, soft_wrap=True).print(text, style=style)

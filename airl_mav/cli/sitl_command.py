@@ -22,8 +22,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.projections import SLOW
-from airl_mav.rehearsal.host_pace import host_problem
-from airl_mav.rehearsal.run_folder import RUN_FILE
+from airl_mav.rehearsal import host_pace, run_folder
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.external.programs import how_to_start
@@ -96,14 +95,14 @@ def on_this_host(
     """
     asked = scenario.scenario
     checked = asked.level == "sitl" and asked.validity
-    if not (checked and (problem := host_problem(scenario.speed or 1.0))):
+    if not (checked and (problem := host_pace.host_problem(scenario.speed or 1.0))):
         return scenario, ""
     warning = f"warning: flights may be invalid, as this host does not keep real time: {problem}"
     try:
         lockstep = resolve(scenario_of(options, level="lockstep"))
     except UsageError:
         return scenario, warning
-    known = options.out is not None and (options.out / RUN_FILE).exists()
+    known = options.out is not None and (options.out / run_folder.RUN_FILE).exists()
     silent = options.quiet or options.json_lines
     if known or silent or not (sys.stdin.isatty() and voice.console.is_terminal):
         return scenario, f"{warning}. Without real time: {lockstep_command(sys.argv[1:])}"

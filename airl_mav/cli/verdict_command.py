@@ -12,8 +12,7 @@ from airl_mav.cli.experiments import OnboardOptions, episodes
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
 from airl_mav.cli.shared_options import Gate, Voice, leave, requirements_of
 from airl_mav.core.fields import COMMON
-from airl_mav.experiments.hardware_gap import seek_verdict
-from airl_mav.experiments.live import EXIT_CODES
+from airl_mav.experiments import hardware_gap, live
 from airl_mav.flight.requirements import LOOKS
 from airl_mav.scenario import model
 
@@ -68,7 +67,7 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
     asked = options.model_copy(update={"require": options.require or (DEFAULT_REQUIREMENT,)})
     requirements = requirements_of(asked)
     with voice:
-        sought = seek_verdict(
+        sought = hardware_gap.seek_verdict(
             scenario_of(options),
             requirements,
             reference=options.reference,
@@ -77,7 +76,7 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
             progress=voice.progress,
         )
         verdict, comparison, runs = sought.verdict, sought.comparison, sought.runs or {}
-        code = EXIT_CODES[sought.ended]
+        code = live.EXIT_CODES[sought.ended]
         if verdict is None or comparison is None:
             voice.finish(code, sought.ended, sought.path)
             return code

@@ -30,8 +30,7 @@ from pydantic_core import (
     core_schema,
 )
 
-from airl_mav.core.addons import entries, load
-from airl_mav.core.errors import FieldError, UsageError, shown
+from airl_mav.core import addons, errors
 
 Model = TypeVar("Model", bound=BaseModel)
 Numbers = TypeVar("Numbers", bound="tuple[float, ...]")
@@ -86,8 +85,8 @@ class AbsentSection(ProfileModel):
 
 def section(name: str) -> type[ProfileModel]:
     """Return the model of a profile's section that an add-on defines; without it, an empty one."""
-    if (place := entries("airl_mav", "PROFILE_SECTIONS").get(name)) is not None:
-        return load(place)  # type: ignore[no-any-return]
+    if (place := addons.entries("airl_mav", "PROFILE_SECTIONS").get(name)) is not None:
+        return addons.load(place)  # type: ignore[no-any-return]
     return AbsentSection
 
 
@@ -229,10 +228,10 @@ def range_of(field: FieldInfo) -> str:
     for bound in (*field.metadata, *inner):
         for sign, name in (("<", "gt"), ("<=", "ge")):
             if getattr(bound, name, None) is not None:
-                low = f"{shown(getattr(bound, name))} {sign} "
+                low = f"{errors.shown(getattr(bound, name))} {sign} "
         for sign, name in (("<", "lt"), ("<=", "le")):
             if getattr(bound, name, None) is not None:
-                high = f" {sign} {shown(getattr(bound, name))}"
+                high = f" {sign} {errors.shown(getattr(bound, name))}"
     unit = unit_of(field)
     if not low and not high:
         return ""
@@ -252,14 +251,14 @@ def validated(model: type[Model], data: object, source: object = None) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         found = field_error(error, model)
-    except FieldError as error:  # A validator of several fields names the field.
+    except errors.FieldError as error:  # A validator of several fields names the field.
         found = error
     if source is None:
         raise found
-    raise UsageError(f"{source}: {found.line(sign=' = ')}")
+    raise errors.UsageError(f"{source}: {found.line(sign=' = ')}")
 
 
-def field_error(error: ValidationError, model: type[BaseModel] | None = None) -> FieldError:
+def field_error(error: ValidationError, model: type[BaseModel] | None = None) -> errors.FieldError:
     """Return the first error of a failed validation as one line.
 
     The fields of `model` give ranges and names; None for other types that pydantic validates,
@@ -275,23 +274,23 @@ def field_error(error: ValidationError, model: type[BaseModel] | None = None) ->
     others = len(findings) - len(same)
     tail = f" (and {others} more)" if others else ""
     if kind == "missing":
-        return FieldError(field, problem=f"missing{tail}")
+        return errors.FieldError(field, problem=f"missing{tail}")
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         names = _field_names(model, path[:-1])
         near = difflib.get_close_matches(str(path[-1])[:100], names, n=1)
         listed = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
         hint = f"; did you mean {near[0]!r}?" if near else f"; fields: {listed}" if names else ""
-        return FieldError(field, problem=f"unknown field{hint}{tail}")
+        return errors.FieldError(field, problem=f"unknown field{hint}{tail}")
     if kind in ("union_tag_invalid", "union_tag_not_found"):
         context = first.get("ctx", {})
         name = f"{field}.{str(context['discriminator']).strip(chr(39))}"
         if "expected_tags" not in context:
-            return FieldError(name, problem=f"missing{tail}")
-        return FieldError(name, context["tag"], f"{context['expected_tags']}{tail}")
+            return errors.FieldError(name, problem=f"missing{tail}")
+        return errors.FieldError(name, context["tag"], f"{context['expected_tags']}{tail}")
     if kind == "value_error":
-        return FieldError(field, problem=first["msg"].removeprefix("Value error, ") + tail)
+        return errors.FieldError(field, problem=first["msg"].removeprefix("Value error, ") + tail)
     accepted = " or ".join(dict.fromkeys(_accepted(finding, model) for finding in same))
-    return FieldError(field, first["input"], accepted + tail)
+    return errors.FieldError(field, first["input"], accepted + tail)
 
 
 _BRANCH = ""

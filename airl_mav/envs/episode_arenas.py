@@ -10,13 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from airl_mav.arena import geometry, placement
 from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena
-from airl_mav.arena.placement import zone_radius_m
 from airl_mav.camera.render import colour
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.arena_batch import batch_of, put_arena, with_room
-from airl_mav.envs.mesh_batch import MeshesSeen
+from airl_mav.envs import arena_batch, mesh_batch
 from airl_mav.envs.spec import Curriculum, EnvironmentSpec
 from airl_mav.profiles.arena import ArenaSpec
 
@@ -55,7 +53,7 @@ def check_stage(stages: list[CurriculumStage], arena: ArenaSpec, stage: int | No
     if stage is None or 0 <= stage < len(stages):
         return
     if len(stages) == len(arena.zones_m):
-        zone_radius_m(arena, stage)
+        placement.zone_radius_m(arena, stage)
     raise UsageError(f"zone = {stage}: accepted: 0 <= value <= {len(stages) - 1}, the stages")
 
 
@@ -139,7 +137,7 @@ class EpisodeArenas:
         self.stages = stages_of(spec.curriculum, arena)
         self._name, self._vehicle_width_m = Path(spec.arena).stem, vehicle_width_m
         self._arena_seed = arena_seed
-        self.present: list[Arena | None] = [None] * n
+        self.present: list[geometry.Arena | None] = [None] * n
         """Arena of each slot; None before its first episode."""
         self.seeds = np.zeros(n, np.int64)
         """(n,) seeds of the episodes."""
@@ -147,13 +145,13 @@ class EpisodeArenas:
         """(n,) zones, or stages, that bound the goals; -1 = the whole arena."""
         self.begun = np.zeros(n, np.bool_)
         """(n,) True if an episode has started."""
-        self.batch = batch_of([])
+        self.batch = arena_batch.batch_of([])
         """Arenas for the kernels; replaced when an arena exceeds their capacity."""
         self.looks = colour("looks")(n) if looks else None
         """Appearance of the arenas; None if not needed."""
-        self.meshes = MeshesSeen(n)
+        self.meshes = mesh_batch.MeshesSeen(n)
         """Meshes visible to cameras."""
-        self._ahead: dict[tuple[int, int | None], Arena] = {}
+        self._ahead: dict[tuple[int, int | None], geometry.Arena] = {}
         """Arenas generated ahead, by seed and zone."""
 
     def check_zone(self, zone: int | None) -> None:
@@ -168,13 +166,13 @@ class EpisodeArenas:
         self._look_at(i, arena)
         if len(self.batch.bounds) == 0:
             # Other slots use the first arena until their episodes start.
-            self.batch = batch_of([arena] * len(self.present))
+            self.batch = arena_batch.batch_of([arena] * len(self.present))
         try:
-            put_arena(self.batch, i, arena)
+            arena_batch.put_arena(self.batch, i, arena)
         except ValueError:
             # The arena exceeds the batch's capacity.
-            self.batch = with_room(self.batch, arena)
-            put_arena(self.batch, i, arena)
+            self.batch = arena_batch.with_room(self.batch, arena)
+            arena_batch.put_arena(self.batch, i, arena)
 
     def prepare(self, seeds: Sequence[int], zone: int | None) -> None:
         """Generate the arenas of likely next episodes; discards previously prepared ones.
@@ -201,18 +199,18 @@ class EpisodeArenas:
         ]
         spare = next((arena for arena in self.present if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.present]
-        self.batch = batch_of([arena for arena in room if arena is not None])
+        self.batch = arena_batch.batch_of([arena for arena in room if arena is not None])
         for i, arena in enumerate(self.present):
             if arena is not None:
                 self._look_at(i, arena)
 
-    def _look_at(self, i: int, arena: Arena) -> None:
+    def _look_at(self, i: int, arena: geometry.Arena) -> None:
         """Add meshes and appearance of slot i's arena for the cameras."""
         self.meshes.put(i, arena)
         if self.looks is not None:
             self.looks.put(i, arena)
 
-    def _made(self, seed: int, zone: int | None) -> Arena:
+    def _made(self, seed: int, zone: int | None) -> geometry.Arena:
         stage = None if zone is None else self.stages[zone]
         return generate(
             self.spec if stage is None else stage.arena,

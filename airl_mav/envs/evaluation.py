@@ -15,8 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import US_PER_S, CommandKind
-from airl_mav.core.errors import UsageError
+from airl_mav.core import constants, errors
 from airl_mav.envs.fleet import Fleet, FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
@@ -104,7 +103,7 @@ class LearnedPilots:
                 row = {key: array[i : i + 1] for key, array in encoded.items()}
                 chosen[i] = commands(card.actions, self._own[int(i)].act_batch(row))[0]
         except ValueError as error:
-            raise UsageError(f"policy {card.name}: {error}") from None
+            raise errors.UsageError(f"policy {card.name}: {error}") from None
         return chosen
 
 
@@ -115,12 +114,12 @@ class SinglePilots:
         self,
         make: Callable[[], Policy],
         max_speed_m_s: float,
-        commands: CommandKind = "velocity",
+        commands: constants.CommandKind = "velocity",
     ) -> None:
         """Store the policy factory, the speed limit of its actions [m/s], and the command kind."""
         self._make = make
         self._max_speed_m_s = max_speed_m_s
-        self._commands: CommandKind = commands
+        self._commands: constants.CommandKind = commands
         self._policies: dict[int, Policy] = {}
 
     def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
@@ -308,7 +307,7 @@ class _Tables:
 class Trace:
     """Recorder of n flights; a slot's record is kept until its next flight starts."""
 
-    def __init__(self, n: int, commands: CommandKind = "velocity") -> None:
+    def __init__(self, n: int, commands: constants.CommandKind = "velocity") -> None:
         """Create a recorder for policies with a command type, by default velocity."""
         self._column = SETPOINTS[commands]
         self._samples = _Tables(n, STATE, np.float64)
@@ -341,7 +340,7 @@ class Trace:
         now = fleet.time_us[who]
         first = now == 0
         # The first sample has no interval; 1 s avoids a division by zero.
-        passed_s = np.where(first, 1.0, (now - self._sampled_us[who]) / US_PER_S)
+        passed_s = np.where(first, 1.0, (now - self._sampled_us[who]) / constants.US_PER_S)
         mean_w = np.where(first, 0.0, (fleet.energy[who] - self._sampled_j[who]) / passed_s)
         state = [fleet.position[who], fleet.velocity[who], fleet.quaternion[who]]
         self._samples.append(who, np.column_stack([now, *state, mean_w]))

@@ -52,11 +52,9 @@ from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.prediction import Compensator
+from airl_mav.profiles import camera, loading, projections
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
-from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
-from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import Payload, VehicleProfile, check_spread, equipped
 from airl_mav.vehicle.airframe import draw_airframe, spreads
 
@@ -145,9 +143,9 @@ class Navigation(Stateful):
             vehicle, computer = equipped(spec.vehicle, spec.delay.computer, Payload())
             computer_w = computer.onboard_watts
         self.vehicle: VehicleProfile = vehicle
-        self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
+        self.arena_spec: ArenaSpec = arena or loading.load_profile("arenas", spec.arena, ArenaSpec)
         sight = sight_of(spec, self.vehicle)
-        self.camera: Camera = sight.camera
+        self.camera: camera.Camera = sight.camera
         self.observation: ObservationSpec = sight.observation
         self._image_shape = self.observation.image_shape
         self.intrinsics: Intrinsics = sight.intrinsics
@@ -559,7 +557,7 @@ class Navigation(Stateful):
         self.cameras.capture(seen, arenas, who, self.seeds)
 
 
-def compile_vectorized(kind: CameraKind) -> None:
+def compile_vectorized(kind: projections.CameraKind) -> None:
     """Compile all kernels by a flight of a few decisions."""
     flying = _navigation(kind)
     flying.begin([0], [1])
@@ -574,10 +572,10 @@ def compile_dynamics() -> None:
     _navigation("depth").compile_dynamics()
 
 
-def compile_images(kind: CameraKind) -> None:
+def compile_images(kind: projections.CameraKind) -> None:
     """Compile arenas and images."""
     _navigation(kind).begin([0], [1])
 
 
-def _navigation(kind: CameraKind) -> Navigation:
+def _navigation(kind: projections.CameraKind) -> Navigation:
     return Navigation(EnvironmentSpec.model_validate({"camera": {"kind": kind}}), 1)

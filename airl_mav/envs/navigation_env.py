@@ -9,9 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_yaw
+from airl_mav.core import constants, errors, frames
 from airl_mav.envs.episode_arenas import CurriculumState
 from airl_mav.envs.fleet import FlightArrays, FlightStatus
 from airl_mav.envs.navigation import Navigation
@@ -20,9 +18,8 @@ from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import SHIPPED_REWARDS, Costs, EnvironmentSpec, gymnasium_spec
 from airl_mav.envs.stopping import bounded
 from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
+from airl_mav.policy import layouts, observation_spec
 from airl_mav.policy.actions import ActionSpec, commands, continuous_numbers, discrete_actions
-from airl_mav.policy.layouts import Encoded, boxes, newest_frame
-from airl_mav.policy.observation_spec import ObservationSpec
 
 FIRST_TRAINING_SEED = 1_000_000
 """First seed that episodes draw automatically; lower seeds are reserved for evaluation."""
@@ -136,13 +133,13 @@ def outcome(flights: FlightArrays, i: int) -> dict[str, Any]:
     return {"success": verdict == FlightStatus.SUCCESS, "outcome": verdict.name.lower()}
 
 
-def observation_space(spec: ObservationSpec) -> gym.spaces.Dict:
+def observation_space(spec: observation_spec.ObservationSpec) -> gym.spaces.Dict:
     """Return the Dict space of a layout."""
     arrays: dict[str, gym.Space[Any]] = {
         key: gym.spaces.Box(
             max(box.low, -UNBOUNDED), min(box.high, UNBOUNDED), box.shape, box.dtype
         )
-        for key, box in boxes(spec).items()
+        for key, box in layouts.boxes(spec).items()
     }
     return gym.spaces.Dict(arrays)
 
@@ -193,17 +190,17 @@ def zone_option(options: Mapping[str, Any] | None) -> int | None:
     """Return the zone option of `reset`. Raises UsageError for other options or types."""
     options = options or {}
     if unknown := [key for key in options if key != "zone"]:
-        raise UsageError(f"options: {', '.join(map(str, unknown))}; accepted: zone")
+        raise errors.UsageError(f"options: {', '.join(map(str, unknown))}; accepted: zone")
     zone = options.get("zone")
     if zone is not None and (isinstance(zone, bool) or not isinstance(zone, int | np.integer)):
-        raise UsageError(f"options: zone = {zone!r}: accepted: a whole number")
+        raise errors.UsageError(f"options: zone = {zone!r}: accepted: a whole number")
     return None if zone is None else int(zone)
 
 
 def episode_seed(seed: Any) -> int:
     """Return the seed of an episode as a Python int. Raises UsageError."""
     if not isinstance(seed, int | np.integer) or not 0 <= seed <= MOST_SEED:
-        raise UsageError(f"seed = {seed!r}: accepted: a whole number, 0 to 2^63 - 1")
+        raise errors.UsageError(f"seed = {seed!r}: accepted: a whole number, 0 to 2^63 - 1")
     return int(seed)
 
 
@@ -213,7 +210,7 @@ def draw_seeds(rng: np.random.Generator, n: int) -> list[int]:
     return drawn
 
 
-class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
+class NavigationEnv(FleetDecisions, gym.Env[layouts.Encoded, Any]):
     """Environment of one vehicle that flies to its goal; a step is a decision and its hold.
 
     Observation: a Dict of `velocity`, `goal` and the image under the key `depth`, `rgb` or `grey`,
@@ -247,7 +244,7 @@ class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Encoded, dict[str, Any]]:
+    ) -> tuple[layouts.Encoded, dict[str, Any]]:
         """Start an episode.
 
         Args:
@@ -270,7 +267,7 @@ class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
         self._pictures.begin()
         return self._observe(), self._info(flights)
 
-    def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[layouts.Encoded, float, bool, bool, dict[str, Any]]:
         """Fly one decision; see Gymnasium's Env.step.
 
         Raises:
@@ -294,13 +291,13 @@ class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
         """Close the window."""
         self._pictures.close()
 
-    def _observe(self) -> Encoded:
+    def _observe(self) -> layouts.Encoded:
         seen = {key: value[0] for key, value in self.navigation.observe().items()}
         if self._pictures.wanted:
             self._pictures.see(self._moment(seen))
         return seen
 
-    def _moment(self, seen: Encoded) -> PictureContent:
+    def _moment(self, seen: layouts.Encoded) -> PictureContent:
         navigation = self.navigation
         arena, flights, truth = navigation.arenas[0], navigation.flights(), navigation.truth()
         assert arena is not None  # noqa: S101 (an episode has begun)
@@ -309,9 +306,9 @@ class NavigationEnv(FleetDecisions, gym.Env[Encoded, Any]):
             arena,
             flights,
             truth.position[0],
-            float(quat_yaw(truth.quaternion[0])),
-            round(flights.time_s[0] * US_PER_S),
-            newest_frame(navigation.observation, seen),
+            float(frames.quat_yaw(truth.quaternion[0])),
+            round(flights.time_s[0] * constants.US_PER_S),
+            layouts.newest_frame(navigation.observation, seen),
         )
 
     def _info(self, now: FlightArrays) -> dict[str, Any]:

@@ -13,8 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.saved_state import Stateful
-from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.envs import saved_state, vector
 from airl_mav.policy.layouts import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
@@ -42,7 +41,7 @@ class Watcher(Protocol):
         """
 
 
-class Expert(Stateful):
+class Expert(saved_state.Stateful):
     """Expert that labels the flown states, for imitation learning."""
 
     @abstractmethod
@@ -50,14 +49,14 @@ class Expert(Stateful):
         """Start episodes in slots."""
 
 
-class NavigationVecEnv(Stateful, VecEnv):
+class NavigationVecEnv(saved_state.Stateful, VecEnv):
     """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`.
 
     The info of a step is empty except for episodes that end in the step. `episode` has the format
     of SB3's Monitor, so no Monitor is needed; its time `t` is the flight time [s].
     """
 
-    def __init__(self, env: NavigationVectorEnv, watcher: Watcher | None = None) -> None:
+    def __init__(self, env: vector.NavigationVectorEnv, watcher: Watcher | None = None) -> None:
         """Wrap a vectorized environment; `watcher` observes it.
 
         Raises:

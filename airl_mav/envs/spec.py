@@ -11,6 +11,7 @@ from airl_mav.core.errors import FieldError, UnexpectedArgumentError, UsageError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
+from airl_mav.policy import layouts, observation_spec
 from airl_mav.policy.actions import (
     BODY_RATES,
     MAX_RATE_DEG_S,
@@ -21,8 +22,6 @@ from airl_mav.policy.actions import (
     DecisionTiming,
     MaxRate,
 )
-from airl_mav.policy.layouts import LEAST_ROWS, STRIP_ROWS
-from airl_mav.policy.observation_spec import CameraName, Frames, GoalHeight, LayoutName, Told
 from airl_mav.profiles import projections
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
 from airl_mav.profiles.vehicle import SensorNoise, Spread, WindSettings, load_vehicle
@@ -118,11 +117,11 @@ class FurtherView(ProfileModel):
     image_height_px: int | None = quantity(
         "image that the network sees; left out: as high as the camera's",
         "px",
-        ge=LEAST_ROWS,
+        ge=layouts.LEAST_ROWS,
         le=480,
         default=None,
     )
-    frames: Frames = 1
+    frames: observation_spec.Frames = 1
 
 
 class Delay(ProfileModel):
@@ -265,7 +264,7 @@ class EnvironmentSpec(ProfileModel):
 
     vehicle: str = Field(default="quad", description="vehicle profile")
     arena: str = Field(default="static-obstacles", description="arena profile")
-    layout: LayoutName = Field(
+    layout: observation_spec.LayoutName = Field(
         default="body",
         description="observation layout: body, paper, scan, or your own as MODULE:NAME or"
         " FILE.py:NAME",
@@ -278,13 +277,13 @@ class EnvironmentSpec(ProfileModel):
         le=480,
         default=24,
     )
-    frames: Frames = 1
-    in_flight: tuple[Told, ...] = Field(
+    frames: observation_spec.Frames = 1
+    in_flight: tuple[observation_spec.Told, ...] = Field(
         default=(),
         description="additional inputs of the network: command, latency, age, setpoint, tilt,"
         " rates, height",
     )
-    goal_height: GoalHeight = False
+    goal_height: observation_spec.GoalHeight = False
     actions: ActionSetName = Field(
         default="arc-25",
         description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw; with a vertical"
@@ -303,7 +302,7 @@ class EnvironmentSpec(ProfileModel):
         description="of unsteady commands, energy and failures, beside the reward",
     )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
-    cameras: dict[CameraName, FurtherView] = later_field(
+    cameras: dict[observation_spec.CameraName, FurtherView] = later_field(
         dict, "further cameras of the vehicle that the network sees by, by their names"
     )
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
@@ -418,5 +417,5 @@ def gymnasium_spec(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> En
         return made
     camera = made.camera.of(load_vehicle(made.vehicle).camera)
     # Layout `paper` has additional rows.
-    rows = camera.height_px + (STRIP_ROWS if made.layout == "paper" else 0)
+    rows = camera.height_px + (layouts.STRIP_ROWS if made.layout == "paper" else 0)
     return spec_of(None, {**knobs, "image_width_px": camera.width_px, "image_height_px": rows})

@@ -13,10 +13,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs import navigation_env, saved_state
-from airl_mav.envs.fleet import FlightArrays, FlightStatus
+from airl_mav.envs import fleet, navigation_env, saved_state, world
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.layouts import Encoded
 
 AHEAD = 32
@@ -159,7 +157,7 @@ class NavigationVectorEnv(
             raise gym.error.ResetNeeded("step() after the end of an episode")
         now, reward, ending = self._decide(actions, (self.num_envs,))
         seen = self.navigation.observe()
-        ended = ending != GOES_ON
+        ended = ending != world.GOES_ON
         final: dict[str, Any] = {}
         begun = over
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
@@ -176,7 +174,7 @@ class NavigationVectorEnv(
             for key, first in self.navigation.observe(slots).items():
                 seen[key][slots] = first
         info = _masked(self._quality(now)) | final
-        return seen, reward, ending == TERMINATED, ending == TRUNCATED, info
+        return seen, reward, ending == world.TERMINATED, ending == world.TRUNCATED, info
 
     def _over(self) -> NDArray[np.bool_]:
         """Return the mask (n,) of flights that ended in an earlier step and have not restarted."""
@@ -195,7 +193,7 @@ class NavigationVectorEnv(
         return seeds
 
     def _final(
-        self, seen: Encoded, flights: FlightArrays, ended: NDArray[np.bool_]
+        self, seen: Encoded, flights: fleet.FlightArrays, ended: NDArray[np.bool_]
     ) -> dict[str, Any]:
         """Return `final_obs` and `final_info` of the episodes that ended, and their masks."""
         info = self._quality(flights) | _outcomes(flights, ended)
@@ -254,12 +252,12 @@ class NavigationVectorEnv(
             raise UsageError(f"state: of an environment with another {', '.join(changed)}")
 
 
-def _outcomes(flights: FlightArrays, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+def _outcomes(flights: fleet.FlightArrays, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
     """Return the additional entries of `info` for flights that have ended."""
     outcomes = np.full(len(ended), None, dtype=object)
     for i in np.flatnonzero(ended).tolist():
         outcomes[i] = navigation_env.outcome(flights, i)["outcome"]
-    return {"success": flights.verdict == FlightStatus.SUCCESS, "outcome": outcomes}
+    return {"success": flights.verdict == fleet.FlightStatus.SUCCESS, "outcome": outcomes}
 
 
 def _masked(

@@ -19,19 +19,12 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from airl_mav.core import compiling, constants, errors, files, first_start, machine
 from airl_mav.core.clock import WallClock
-from airl_mav.core.compiling import COMPILING
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import read_typed, write_json
-from airl_mav.core.first_start import compile_first
-from airl_mav.core.machine import provenance
 from airl_mav.core.progress import Progress
-from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, WorkerError, never
-from airl_mav.experiments.live import Ended
+from airl_mav.experiments import executors, live
 from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.rehearsal import run_folder
-from airl_mav.rehearsal.observer import Tally
+from airl_mav.rehearsal import observer, run_folder
 from airl_mav.rehearsal.run_folder import (
     CAMPAIGN_FILE,
     FlownEpisode,
@@ -122,7 +115,7 @@ class EpisodeSaver:
         clock = WallClock()
         if episodes:
             self._folder.save_episodes(episodes)
-        return clock.time_us() / US_PER_S
+        return clock.time_us() / constants.US_PER_S
 
 
 @dataclass(frozen=True)
@@ -135,7 +128,7 @@ class LockstepFlier:
         """Return the episodes per job; see `Flier`."""
         return 1
 
-    def start(self, folder: run_folder.RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (polled between flights)
+    def start(self, folder: run_folder.RunFolder, stop: executors.Stop) -> executors.FlyEpisodes:  # noqa: ARG002 (polled between flights)
         """Load simulator and policy once; see `Flier`."""
         # Imported here: only workers need the flight controller and MAVSDK.
         from airl_mav.lockstep.lockstep_flight import fly
@@ -154,14 +147,14 @@ class LockstepFlier:
         return fly_all
 
 
-def _gym_flier(scenario: ResolvedScenario) -> Flier:
+def _gym_flier(scenario: ResolvedScenario) -> executors.Flier:
     # Imported here: level lockstep does not need the vectorized simulator.
     from airl_mav.experiments.gym_flier import GymFlier
 
     return GymFlier(scenario)
 
 
-FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {
+FLIERS: dict[str, Callable[[ResolvedScenario], executors.Flier]] = {
     "gym": _gym_flier,
     "lockstep": LockstepFlier,
 }
@@ -188,7 +181,7 @@ class Cell:
             _ = self.flier
 
     @property
-    def flier(self) -> Flier:
+    def flier(self) -> executors.Flier:
         """Flier of the cell's episodes."""
         return FLIERS[self.scenario.scenario.level](self.scenario)
 
@@ -219,7 +212,7 @@ class CampaignRun:
     """Started cells, in the order of the campaign, including earlier calls."""
     complete: bool
     """True if all episodes of all cells have been flown."""
-    ended: Ended
+    ended: live.Ended
     """Also "interrupted" if the last flight had ended: subsequent work must not start."""
     error: str | None
     """Error that ended the campaign: a job failed, or lost its worker too often."""
@@ -228,10 +221,10 @@ class CampaignRun:
 def run_cell(
     out: Path | None,
     cell: Cell,
-    executor: Executor,
+    executor: executors.Executor,
     *,
     progress: Progress | None = None,
-    stop: Stop = never,
+    stop: executors.Stop = executors.never,
 ) -> CampaignRun:
     """Fly the rest of one evaluation; see `run_cells`. Without `out` a new folder is created."""
     return _run({cell.name: out}, [cell], executor, progress or Progress(), stop)
@@ -240,10 +233,10 @@ def run_cell(
 def run_cells(
     root: Path,
     cells: Sequence[Cell],
-    executor: Executor,
+    executor: executors.Executor,
     *,
     progress: Progress | None = None,
-    stop: Stop = never,
+    stop: executors.Stop = executors.never,
     ended: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
     """Fly the rest of a campaign in `root` until `stop`, polled several times per second.
@@ -303,11 +296,11 @@ class _Job:
 class _Start:
     """Initializer of a worker. A worker holds one cell at a time; the next cell replaces it."""
 
-    fliers: Mapping[str, Flier]
+    fliers: Mapping[str, executors.Flier]
 
-    def __call__(self, stop: Stop) -> Callable[[_Job], Iterable[run_folder.FlownEpisode]]:
+    def __call__(self, stop: executors.Stop) -> Callable[[_Job], Iterable[run_folder.FlownEpisode]]:
         """Return the function that carries out a job."""
-        loaded: tuple[str, FlyEpisodes] | None = None
+        loaded: tuple[str, executors.FlyEpisodes] | None = None
 
         def fly(job: _Job) -> Iterable[run_folder.FlownEpisode]:
             nonlocal loaded
@@ -337,7 +330,7 @@ class _OpenCell:
                     "yellow",
                 )
             self._saver = stack.enter_context(EpisodeSaver(self.folder))
-            self._tally = Tally(progress, cell.title, self.folder.path, self.done, planned)
+            self._tally = observer.Tally(progress, cell.title, self.folder.path, self.done, planned)
             stack.callback(self._tally.close)
             # Only a fully opened cell keeps its lock; an error before releases it.
             self.stack = stack.pop_all()
@@ -365,9 +358,9 @@ class _OpenCell:
 def _run(
     paths: Mapping[str, Path | None],
     cells: Sequence[Cell],
-    executor: Executor,
+    executor: executors.Executor,
     progress: Progress,
-    stop: Stop,
+    stop: executors.Stop,
     tell: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
     """Fly the remaining episodes of cells with different flights, each into its folder."""
@@ -402,7 +395,7 @@ def _run(
                     close(flying)
                     continue
                 # Compile here, once, or every worker would compile the same kernels.
-                compile_first([plan_of(cell.scenario)], progress, stop)
+                first_start.compile_first([plan_of(cell.scenario)], progress, stop)
                 size = len(left)
                 # Executors that stream results take whole cells; others return a job's results at
                 # its end.
@@ -425,7 +418,7 @@ def _run(
             name=name,
             stop=stop,
             lost=partial(progress.note, style="yellow"),
-            compiling=lambda begins: progress.status(COMPILING if begins else None),
+            compiling=lambda begins: progress.status(compiling.COMPILING if begins else None),
         )
         try:
             # Stops the workers before the folders are closed.
@@ -436,11 +429,11 @@ def _run(
                     everything.advance()
                     if flying.complete:
                         close(flying)
-        except WorkerError as problem:
+        except executors.WorkerError as problem:
             error = str(problem)
     runs = [opened[cell.name].run() for cell in cells if cell.name in opened]
     complete = len(runs) == len(cells) and all(run.complete for run in runs)
-    ended: Ended = "complete"
+    ended: live.Ended = "complete"
     if error is not None:
         ended = "broken off"
     # A stop after the last flight also counts: subsequent work must not start.
@@ -500,7 +493,7 @@ _CAMPAIGN = TypeAdapter(Campaign)
 
 def load_campaign(path: Path) -> Campaign:
     """Read the declaration of the campaign in a folder. Raises UsageError."""
-    return read_typed(path / CAMPAIGN_FILE, _CAMPAIGN, SCHEMA, "campaign")
+    return files.read_typed(path / CAMPAIGN_FILE, _CAMPAIGN, SCHEMA, "campaign")
 
 
 @contextmanager
@@ -524,14 +517,14 @@ def open_campaign(
         check_folder(path, CAMPAIGN_FILE)
         held = load_campaign(path) if (path / CAMPAIGN_FILE).exists() else None
         if held and (difference := _difference(held.declaration, declaration, free, growing)):
-            raise UsageError(
+            raise errors.UsageError(
                 f"--out {path}: holds a campaign with {difference}; accepted: another folder, or "
                 "the same settings to go on"
             )
-        campaign = Campaign(declaration, held.made if held else provenance(command))
+        campaign = Campaign(declaration, held.made if held else machine.provenance(command))
         # An unchanged file keeps its date.
         if campaign != held:
-            write_json(path / CAMPAIGN_FILE, asdict(campaign))
+            files.write_json(path / CAMPAIGN_FILE, asdict(campaign))
         yield campaign
 
 

@@ -9,14 +9,10 @@ from typing import Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
-from airl_mav.experiments import experiment
-from airl_mav.experiments.campaign import Cell
+from airl_mav.experiments import campaign, experiment
 from airl_mav.faults import Fault
-from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.statistics import aggregate
-from airl_mav.policy.card import MeasuredResult
-from airl_mav.policy.card_writing import add_result
-from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.flight import episode_record, statistics
+from airl_mav.policy import card, card_writing, registry
 from airl_mav.scenario.model import DEFAULT_ARENA, LevelName, Scenario
 
 SHARED = (
@@ -86,11 +82,11 @@ def evaluation_cells(
     arenas: Sequence[str] = (),
     *,
     each_fault: bool = False,
-) -> tuple[Cell, ...]:
+) -> tuple[campaign.Cell, ...]:
     """Return an evaluation per policy and arena, and per fault with `each_fault`, or UsageError."""
     if not policies:
         raise FieldError("policies", accepted="one or more names or folders")
-    found = [find_policy(name, trust=scenario.trust) for name in policies]
+    found = [registry.find_policy(name, trust=scenario.trust) for name in policies]
     _check_names("policies", [policy.name for policy in found])
     if not arenas:
         arenas = list(dict.fromkeys(training_arena(policy) for policy in found))
@@ -116,12 +112,12 @@ def evaluation_cells(
     )
 
 
-def training_arena(policy: PolicyInfo) -> str:
+def training_arena(policy: registry.PolicyInfo) -> str:
     """Return the training arena of a policy, or the default arena."""
     return (None if policy.card is None else policy.card.training.arena) or DEFAULT_ARENA
 
 
-def check_plain(cells: Sequence[Cell]) -> None:
+def check_plain(cells: Sequence[campaign.Cell]) -> None:
     """Raise UsageError if settings keep the results off the policies' cards."""
     for cell in cells:
         asked, usual = cell.scenario.scenario, Scenario()
@@ -132,16 +128,16 @@ def check_plain(cells: Sequence[Cell]) -> None:
             raise FieldError("on_card", problem=f"{cell.scenario.policy.name} has no card")
 
 
-def write_on_card(cell: Cell, episodes: Sequence[EpisodeRecord]) -> None:
+def write_on_card(cell: campaign.Cell, episodes: Sequence[episode_record.EpisodeRecord]) -> None:
     """Write the results of a finished evaluation onto the policy's card, replacing earlier ones."""
     asked, folder = cell.scenario.scenario, cell.scenario.policy.folder
     if folder is None:
         return
     workload = None if asked.workload is None else f"{asked.computer}/{asked.workload}"
-    add_result(
+    card_writing.add_result(
         folder,
-        MeasuredResult.of(
-            aggregate(episodes),
+        card.MeasuredResult.of(
+            statistics.aggregate(episodes),
             arena=cell.scenario.arena_name,
             level=asked.level,
             latency=asked.latency or workload,
@@ -201,7 +197,7 @@ def declare_latency_sweep(
         raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
     names = list(policies) or [scenario.policy]
     cells = []
-    found = [find_policy(name, trust=scenario.trust).name for name in names]
+    found = [registry.find_policy(name, trust=scenario.trust).name for name in names]
     flown_as: list[dict[str, Any]] = [{}, {"compensate": True}] if compensated else [{}]
     for (path, name), way in product(zip(names, found, strict=True), flown_as):
         policy = f"{name}, compensated" if way else name

@@ -30,9 +30,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import quantity
 from airl_mav.core.machine import usable_cores
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
-from airl_mav.scenario.model import GREATEST_WORKERS, Workers
-from airl_mav.scenario.resolve import PlannedEpisode
+from airl_mav.scenario import aircraft, model, resolve
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -131,7 +129,7 @@ class InProcessExecutor:
                     raise UsageError(f"{name(job)}: {error}") from None
 
 
-class ExecutorSettings(Workers):
+class ExecutorSettings(model.Workers):
     """Executor of an experiment and the resources of a job."""
 
     ray_gpus: float = quantity("share of a GPU for each job", "1", ge=0.0, le=8.0, default=0.0)
@@ -171,7 +169,7 @@ def next_attempt(job: str, attempt: int, cause: str, lost: Callable[[str], None]
     return attempt + 1
 
 
-FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
+FlyEpisodes = Callable[[Sequence[resolve.PlannedEpisode]], Iterable[FlownEpisode]]
 
 
 class Flier(Protocol):
@@ -460,18 +458,18 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, name="parent-death-guard", daemon=True).start()
 
 
-def side_by_side(settings: Workers) -> int:
+def side_by_side(settings: model.Workers) -> int:
     """Return the maximum of parallel flights; the user starts PX4's instances."""
-    if not isinstance(settings, Aircraft) or settings.firmware == "builtin":
-        return GREATEST_WORKERS
+    if not isinstance(settings, aircraft.Aircraft) or settings.firmware == "builtin":
+        return model.GREATEST_WORKERS
     real = settings.real
-    return 1 if real.px4_dir is None else GREATEST_INSTANCE + 1 - real.instance
+    return 1 if real.px4_dir is None else aircraft.GREATEST_INSTANCE + 1 - real.instance
 
 
 @contextmanager
-def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Executor]:
+def open_executor(settings: model.Workers, *, in_process: bool = False) -> Iterator[Executor]:
     """Open the configured executor; a single worker may be this process if `in_process`."""
-    cores = min(usable_cores(), GREATEST_WORKERS)
+    cores = min(usable_cores(), model.GREATEST_WORKERS)
     if settings.executor != "process":
         known = entries("airl_mav", "EXECUTORS")
         if settings.executor not in known:

@@ -22,15 +22,11 @@ from airl_mav.core.progress import Progress, RichProgress, new_console
 from airl_mav.experiments import campaign
 from airl_mav.experiments.executors import Executor, open_executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
-from airl_mav.flight.episode_record import EpisodeRecord, run_sha256
-from airl_mav.flight.statistics import Aggregate, aggregate
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight import episode_record, statistics, trajectory
 from airl_mav.latency.stages import Samples, pool, stage_samples
-from airl_mav.rehearsal.rehearsal import RehearsalError
-from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
+from airl_mav.rehearsal import rehearsal, run_folder
+from airl_mav.report import document, run_columns
 from airl_mav.report.comparison.comparison_model import Comparison, Kind, RunEntry
-from airl_mav.report.document import count_flights
-from airl_mav.report.run_columns import TABLES, Columns, TableName
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
@@ -88,7 +84,7 @@ class ExperimentRun:
         """Runs by cell name."""
         return {flown.cell.name: Run(flown.path) for flown in self.cells}
 
-    def compare(self) -> tuple[Comparison, dict[str, LoadedRun]]:
+    def compare(self) -> tuple[Comparison, dict[str, run_folder.LoadedRun]]:
         """Return the comparison and its runs by name. Raises UsageError if no cell has flights."""
         # Imported here: a single evaluation does not need the figures.
         from airl_mav.report.comparison.show import build_comparison
@@ -116,7 +112,7 @@ class ExperimentResult:
         html = addons.entries("airl_mav", "NOTEBOOK").get("comparison")
         if html is None:
             return None
-        loaded = {name: load(run.path) for name, run in self.runs.items()}
+        loaded = {name: run_folder.load(run.path) for name, run in self.runs.items()}
         return str(addons.load(html)(self.comparison, loaded, self.path, self.page))
 
 
@@ -232,7 +228,7 @@ def _fly_live(
 
 def outcome_line(run: campaign.CellRun) -> str:
     """Return the outcomes of a cell's flights as text."""
-    told = count_flights(run.episodes)
+    told = document.count_flights(run.episodes)
     return told if run.new else f"{told} (flown before)"
 
 
@@ -260,23 +256,23 @@ class Run:
     path: Path
 
     @cached_property
-    def _loaded(self) -> LoadedRun:
-        return load(self.path)
+    def _loaded(self) -> run_folder.LoadedRun:
+        return run_folder.load(self.path)
 
     @property
-    def info(self) -> RunInfo:
+    def info(self) -> run_folder.RunInfo:
         """Settings, seeds, versions and machine of the run."""
         return self._loaded.info
 
     @property
-    def episodes(self) -> tuple[EpisodeRecord, ...]:
+    def episodes(self) -> tuple[episode_record.EpisodeRecord, ...]:
         """Records of all episodes, by index."""
         return self._loaded.episodes
 
     @cached_property
-    def quality(self) -> Aggregate:
+    def quality(self) -> statistics.Aggregate:
         """Success rate, and means over the successful flights, each with its 95 % interval."""
-        return aggregate(self.episodes)
+        return statistics.aggregate(self.episodes)
 
     @cached_property
     def latency(self) -> dict[str, Samples]:
@@ -289,27 +285,27 @@ class Run:
         return self._loaded.latency
 
     @property
-    def trajectories(self) -> dict[int, Trajectory]:
+    def trajectories(self) -> dict[int, trajectory.Trajectory]:
         """True paths, by episode index: time [µs], position and velocity NED, attitude, power."""
         return self._loaded.trajectories
 
     @property
     def sha256(self) -> str | None:
         """Digest of all lockstep flights, equal if bit-identical; None at other levels."""
-        return run_sha256(self.episodes)
+        return episode_record.run_sha256(self.episodes)
 
     @property
     def complete(self) -> bool:
         """True if all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
 
-    def table(self, name: TableName = "episodes") -> Columns:
+    def table(self, name: run_columns.TableName = "episodes") -> run_columns.Columns:
         """Return a table as columns by name; `pandas.DataFrame(run.table())` reads it.
 
         Args:
             name: `episodes`, `decisions`, `latency` or `trajectories`.
         """
-        return TABLES[name](self._loaded)
+        return run_columns.TABLES[name](self._loaded)
 
     def _repr_html_(self) -> str | None:
         """Return the notebook view: the verdict, the statistics and a map of the flights."""
@@ -400,6 +396,6 @@ def shown(progress: bool) -> Iterator[Progress]:
 def raise_unless_complete(ended: Ended, problem: str) -> None:
     """Raise RehearsalError or KeyboardInterrupt for work that ended early."""
     if ended == "broken off":
-        raise RehearsalError(problem)
+        raise rehearsal.RehearsalError(problem)
     if ended == "interrupted":
         raise KeyboardInterrupt

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from airl_mav import faults, prediction
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.arena_batch import CEILING, FLOOR, WALL
@@ -24,22 +25,19 @@ from airl_mav.envs.fleet import FlightArrays
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.executors import FlyEpisodes, Stop
-from airl_mav.faults import check_gym
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import measure_quality
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
 from airl_mav.policy.registry import LearnedPolicy
-from airl_mav.prediction import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.checks import action_generator
-from airl_mav.scenario.resolve import PlannedEpisode, ResolvedScenario
+from airl_mav.scenario import checks, resolve
 
 BLOCK_SLOTS = 4
 """Episodes per job and slot: in shorter jobs most slots would wait for the longest flights."""
 
 
-def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
+def environment_of(scenario: resolve.ResolvedScenario) -> EnvironmentSpec:
     """Return the vectorized simulator's environment for a scenario."""
     asked, card = scenario.scenario, scenario.policy.card
     shape: dict[str, Any]
@@ -97,11 +95,11 @@ def _image_of(seen: ObservationSpec | SeenCamera) -> dict[str, int]:
 
 
 def navigation_of(
-    scenario: ResolvedScenario,
+    scenario: resolve.ResolvedScenario,
     slots: int,
     *,
     trace: Trace | None = None,
-    compensator: Compensator | None = None,
+    compensator: prediction.Compensator | None = None,
 ) -> Navigation:
     """Return the vectorized simulator of a scenario, `slots` flights in parallel, or UsageError."""
     asked = scenario.scenario
@@ -126,13 +124,13 @@ def navigation_of(
 class GymFlier:
     """Flier in the vectorized simulator; results do not depend on the slots. Implements `Flier`."""
 
-    scenario: ResolvedScenario
+    scenario: resolve.ResolvedScenario
 
     def __post_init__(self) -> None:
         """Raise UsageError for settings that the vectorized simulator does not support."""
         environment = environment_of(self.scenario)
         pipelined = environment.decisions == "pipelined"
-        check_gym(self.scenario.scenario.faults, pipelined=pipelined)
+        faults.check_gym(self.scenario.scenario.faults, pipelined=pipelined)
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
         """Return the episodes per job; see `executors.Flier`."""
@@ -145,7 +143,7 @@ class GymFlier:
         scenario = self.scenario
         pilots = pilots_of(scenario)
 
-        def fly(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
+        def fly(episodes: Sequence[resolve.PlannedEpisode]) -> Iterator[FlownEpisode]:
             index_of = {episode.seed: episode.index for episode in episodes}
             slots = min(scenario.scenario.slots, len(index_of))
             trace = Trace(slots, scenario.pilot.commands)
@@ -200,12 +198,12 @@ class GymFlier:
         return FlownEpisode(record, trajectory, latency)
 
 
-def pilots_of(scenario: ResolvedScenario) -> Pilots:
+def pilots_of(scenario: resolve.ResolvedScenario) -> Pilots:
     """Return the pilots of all vehicles."""
     loaded = scenario.fresh_policy(scenario.scenario.seed)
     if isinstance(loaded, LearnedPolicy):
         # With the companion's random generator.
-        return LearnedPilots(loaded, action_generator)
+        return LearnedPilots(loaded, checks.action_generator)
     seed = scenario.scenario.seed
     pilot = scenario.pilot
     return SinglePilots(lambda: scenario.fresh_policy(seed), pilot.max_speed_m_s, pilot.commands)

@@ -9,11 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from airl_mav.core.child_process import terminated_as_interrupted
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
-from airl_mav.core.first_start import compile_first
+from airl_mav.core import child_process, errors, first_start, scheduling
 from airl_mav.core.progress import Progress
-from airl_mav.core.scheduling import remove_left
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.live_view import ViewAddresses, ViewError, ViewRequest, view_part
@@ -28,8 +25,8 @@ Ended = Literal["complete", "interrupted", "broken off"]
 
 EXIT_CODES: dict[Ended, int] = {
     "complete": 0,
-    "interrupted": EXIT_INTERRUPTED,
-    "broken off": EXIT_BROKEN,
+    "interrupted": errors.EXIT_INTERRUPTED,
+    "broken off": errors.EXIT_BROKEN,
 }
 
 
@@ -58,13 +55,13 @@ def fly_live(
     """Fly the rest of a scenario, one flight after the other, at level sitl or lockstep."""
     asked = scenario.scenario
     if asked.level == "gym":
-        raise FieldError(
+        raise errors.FieldError(
             "level", asked.level, "lockstep or sitl; airl evaluate flies the vectorized simulator"
         )
     check_program(asked)
     say = partial(progress.note, style="yellow")
     known = out is not None and (out / RUN_FILE).exists()
-    with ExitStack() as held, terminated_as_interrupted():
+    with ExitStack() as held, child_process.terminated_as_interrupted():
         if out is not None:
             # Lock first: processes of a killed run may still be writing.
             keeps = held.enter_context(locked(out, say))
@@ -84,7 +81,7 @@ def fly_live(
         problem = ""
         try:
             # Compile before any process waits for another one.
-            compile_first([plan_of(scenario)], progress)
+            first_start.compile_first([plan_of(scenario)], progress)
             if view is not None:
                 ends, observer = held.enter_context(_watched(scenario, view, live, progress))
             if asked.level == "lockstep":
@@ -99,7 +96,7 @@ def fly_live(
             ended, problem = "broken off", str(error)
         except KeyboardInterrupt:
             ended = "interrupted"
-        except UsageError:
+        except errors.UsageError:
             if not known and not live.finished_records:
                 folder.discard()
             raise
@@ -107,7 +104,7 @@ def fly_live(
             live.close()
             folder.sweep()
             if asked.cpu_quota is not None:
-                remove_left()
+                scheduling.remove_left()
         tell_end(folder.path, ended, problem, progress)
         new = live.finished_records
         episodes = tuple(sorted((*done, *new), key=lambda record: record.index))

@@ -15,8 +15,7 @@ from airl_mav.core.constants import US_PER_S, Level
 from airl_mav.core.files import typed
 from airl_mav.core.frames import Goal
 from airl_mav.core.resource_use import ProcessUse
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.trajectory import Quality
+from airl_mav.flight import judge, trajectory
 from airl_mav.latency.injection import Injection
 
 BUILT_IN = "built-in"
@@ -88,7 +87,7 @@ class EpisodeRecord:
     arena: str
     """Arena name; `NO_ARENA`: unknown."""
     arena_seed: int
-    outcome: Outcome
+    outcome: judge.Outcome
     reason: str
     goal: Goal
     """North, east [m]."""
@@ -106,7 +105,7 @@ class EpisodeRecord:
     """Simulated time skipped because the host could not keep up [µs]."""
     battery_remaining: float | None
     """Remaining charge at the end, 1 to 0."""
-    quality: Quality | None
+    quality: trajectory.Quality | None
     """Flight quality; None without navigation."""
     notes: tuple[str, ...] = ()
     """Other events: failsafes, watchdog trips."""
@@ -189,7 +188,7 @@ def straight_m(record: EpisodeRecord) -> float:
 
 def usual_flight(records: Sequence[EpisodeRecord]) -> UsualFlight:
     """Return the medians of a run; all None if no flight reached the goal."""
-    good = [(r, r.quality) for r in records if r.outcome is Outcome.SUCCESS and r.quality]
+    good = [(r, r.quality) for r in records if r.outcome is judge.Outcome.SUCCESS and r.quality]
     if not good:
         return UsualFlight(None, None, None)
     return UsualFlight(
@@ -221,6 +220,6 @@ def ranked(episodes: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
         lost_s = time_lost_s(e, usual)
         if lost_s is None:
             lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
-        return (e.outcome is Outcome.SUCCESS, -lost_s, e.index)
+        return (e.outcome is judge.Outcome.SUCCESS, -lost_s, e.index)
 
     return sorted(episodes, key=key)

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import heading_to_ned, quats_to_euler
+from airl_mav.core import constants, frames
 from airl_mav.latency.stages import ages_at_effect, deadline_miss_ratio
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 
@@ -172,11 +171,11 @@ class Quality:
 def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
     """Measure the part of a flight between two simulated times [µs]."""
     part = trajectory.between(start_us, end_us)
-    steps_s = np.diff(part.time_us) / US_PER_S
+    steps_s = np.diff(part.time_us) / constants.US_PER_S
     # Power belongs to the step that ends at a sample, so the first value is left out.
     energy_j = float(np.sum(part.power_w[1:] * steps_s))
     return Leg(
-        time_s=(end_us - start_us) / US_PER_S,
+        time_s=(end_us - start_us) / constants.US_PER_S,
         distance_m=float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum()),
         energy_j=energy_j if math.isfinite(energy_j) else None,
     )
@@ -240,7 +239,7 @@ def _conduct(
     misses = None
     # Without a hold time decisions have no deadline.
     if hold_s > 0.0:
-        misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * US_PER_S)
+        misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * constants.US_PER_S)
     return {
         "deadline_misses": misses,
         "jerk_rms_m_s3": None if flown is None else flown.rms_m_s3,
@@ -252,7 +251,7 @@ def _conduct(
     }
 
 
-SAMPLE_S = SAMPLE_US / US_PER_S
+SAMPLE_S = SAMPLE_US / constants.US_PER_S
 
 BANDWIDTH_HZ = 5.0
 """Half-power bandwidth [Hz]. Well above a multicopter's velocity loop (about 1 Hz), well below the
@@ -329,8 +328,8 @@ def commanded_velocity(
     commands = np.vstack([np.zeros(3), setpoints])
     flown = commands[np.searchsorted(sent_us, times_us, side="right")]
     # Unwrapped, so that interpolation does not turn the long way round at 180 degrees.
-    headings = np.unwrap(quats_to_euler(trajectory.quaternion)[2])
-    return heading_to_ned(flown, np.interp(times_us, trajectory.time_us, headings))
+    headings = np.unwrap(frames.quats_to_euler(trajectory.quaternion)[2])
+    return frames.heading_to_ned(flown, np.interp(times_us, trajectory.time_us, headings))
 
 
 def command_steps(decisions: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:

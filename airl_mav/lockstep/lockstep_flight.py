@@ -27,8 +27,7 @@ from airl_mav.rehearsal.firmware_process import episode_setup, state_of
 from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.observer import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
-from airl_mav.scenario.checks import TRANSPORT_US
-from airl_mav.scenario.resolve import ResolvedScenario
+from airl_mav.scenario import checks, resolve
 from companion.pilot import Mission, MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import OperatorText
 from firmware_sim.engine.record import Record
@@ -44,7 +43,7 @@ SHOW_EVERY = 125
 
 
 def rehearse(
-    scenario: ResolvedScenario,
+    scenario: resolve.ResolvedScenario,
     folder: RunFolder,
     observer: Observer,
     done: Collection[int] = (),
@@ -80,7 +79,7 @@ def rehearse(
 
 
 def fly(
-    resolved: ResolvedScenario,
+    resolved: resolve.ResolvedScenario,
     policy: Policy,
     index: int,
     seed: int,
@@ -138,7 +137,7 @@ class LockstepFlight:
 
     def __init__(
         self,
-        resolved: ResolvedScenario,
+        resolved: resolve.ResolvedScenario,
         policy: Policy,
         index: int,
         seed: int,
@@ -200,7 +199,7 @@ class LockstepFlight:
                 self._watched = held.enter_context(closing(tap))
             self._stage = held.enter_context(
                 LockstepStage(
-                    transport_us=TRANSPORT_US,
+                    transport_us=checks.TRANSPORT_US,
                     digest=self._digest,
                     # A viewer controls the pace.
                     speed=resolved.speed if self._view is None else None,

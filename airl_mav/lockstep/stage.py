@@ -15,9 +15,8 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import TracebackType
 
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Patience, SimClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
 from airl_mav.faults import LINKS, Fault
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, FlightDigest, Handle, LockstepError, Turn
@@ -34,8 +33,7 @@ from companion.watchdog import Abandoned, ConductedClock, Poll
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.fault_timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
-from firmware_sim.mavlink.codec import Encoder, dialect, layout
-from firmware_sim.mavlink.px4_links import ONBOARD_HZ
+from firmware_sim.mavlink import codec, px4_links
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 FIRST_BARRIER = 0x8000_0000
@@ -50,11 +48,11 @@ PING_AGAIN_S = 0.1
 HEARTBEAT_S = 1.0
 """Interval at which the newest heartbeat is repeated in a long turn [wall s]."""
 
-LONGEST_ANSWER_US = 10 * US_PER_S
+LONGEST_ANSWER_US = 10 * constants.US_PER_S
 """Maximum time until a command is answered [µs of simulated time]."""
 
-_PING: int = dialect.MAVLINK_MSG_ID_PING
-_PING_LAYOUT = layout("PING")
+_PING: int = codec.dialect.MAVLINK_MSG_ID_PING
+_PING_LAYOUT = codec.layout("PING")
 
 
 class ThreadPartner:
@@ -81,7 +79,7 @@ class ThreadPartner:
         """True while the companion waits for an answer in the middle of its turn."""
         self._sent_before = 0
         """Number of setpoints sent before the current turn."""
-        self._encoder = Encoder()
+        self._encoder = codec.Encoder()
         self._thread: threading.Thread | None = None
 
     def attach(self, link: MavsdkLink) -> None:
@@ -400,7 +398,7 @@ class LockstepStage:
 
     def _raise_what_broke(self) -> None:
         error = self._partner.error
-        if isinstance(error, UsageError):
+        if isinstance(error, errors.UsageError):
             raise error
         if error is not None:
             raise LockstepError(f"the companion broke: {type(error).__name__}: {error}") from error
@@ -419,8 +417,8 @@ _PER_INSTANCE = ("DISTANCE_SENSOR",)
 
 
 STATES = frozenset(
-    layout(name).id_bytes
-    for name, rate_hz in ONBOARD_HZ.items()
+    codec.layout(name).id_bytes
+    for name, rate_hz in px4_links.ONBOARD_HZ.items()
     if rate_hz > 1.0 and name not in _PER_INSTANCE
 )
 """Messages that replace older ones: state streams, and TIMESYNC, whose answer is not sent to the
@@ -428,7 +426,7 @@ vehicle (`conductor`). Answers, events, texts and slow streams such as HEARTBEAT
 
 
 UNREAD = frozenset(
-    layout(name).id_bytes
+    codec.layout(name).id_bytes
     for name in (
         *("HIGHRES_IMU", "ODOMETRY", "ALTITUDE", "ATTITUDE_TARGET", "SERVO_OUTPUT_RAW", "VFR_HUD"),
         *("POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT", "ESC_INFO", "ESC_STATUS"),

@@ -16,12 +16,10 @@ from airl_mav.faults import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from companion.frame_source import ReceivedFrame
+from firmware_sim import fault_timeline, firmware
 from firmware_sim.external.px4_lockstep import OnboardLink, conducted_px4
-from firmware_sim.fault_timeline import FailingLink, failing_link
-from firmware_sim.firmware import BuiltinFlightStack, FlightStack
-from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink import codec, px4_links
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
-from firmware_sim.mavlink.px4_links import LinkConfig, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
 BOOT_UNIX_US = 1_767_225_600 * US_PER_S
@@ -39,13 +37,13 @@ HEARTBEAT_US = US_PER_S
 """Heartbeat interval of PX4 [µs]."""
 
 
-def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
+def lockstep_link(endpoint: SharedEndpoint) -> px4_links.LinkConfig:
     """Return the onboard link configuration for a lockstep companion.
 
     Replies have separate sequence numbers: MAVSDK's requests come at any time, and must not change
     the bytes of the streams. The vehicle flies uninterrupted until slow streams are due.
     """
-    link = onboard_link(endpoint)
+    link = px4_links.onboard_link(endpoint)
     rates = {**link.rates_hz, **MAVSDK_HZ}
     return replace(link, rates_hz=rates, separate_replies=True, slow_every_us=SLOW_EVERY_US)
 
@@ -54,10 +52,10 @@ def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
 class ConductedVehicle:
     """Vehicle for a lockstep flight."""
 
-    stack: FlightStack
+    stack: firmware.FlightStack
     end: VehicleEnd
     """Vehicle's end of the companion's link."""
-    failing: FailingLink | None = None
+    failing: fault_timeline.FailingLink | None = None
     """Link with simulated faults; None = no link faults."""
     heard_after_us: int = 0
     """Maximum time from loading an episode to the first heartbeat [µs]."""
@@ -68,10 +66,10 @@ def builtin_vehicle(clock: Clock, faults: Sequence[Fault] = ()) -> ConductedVehi
     endpoint = MemoryEndpoint()
     failing = None
     if link_fails(faults):
-        failing = failing_link(endpoint, clock, conducted=True)
+        failing = fault_timeline.failing_link(endpoint, clock, conducted=True)
     link = lockstep_link(endpoint if failing is None else failing)
     server = MavlinkServer([link], boot_unix_us=BOOT_UNIX_US)
-    return ConductedVehicle(BuiltinFlightStack(server), InMemory(endpoint), failing)
+    return ConductedVehicle(firmware.BuiltinFlightStack(server), InMemory(endpoint), failing)
 
 
 def real_vehicle(
@@ -95,8 +93,8 @@ is read then and is at most 20 ms old."""
 
 _HEADER = 10
 _COMMANDS = {
-    dialect.MAVLINK_MSG_ID_COMMAND_LONG: slice(_HEADER + 28, _HEADER + 30),
-    dialect.MAVLINK_MSG_ID_COMMAND_INT: slice(_HEADER + 28, _HEADER + 30),
+    codec.dialect.MAVLINK_MSG_ID_COMMAND_LONG: slice(_HEADER + 28, _HEADER + 30),
+    codec.dialect.MAVLINK_MSG_ID_COMMAND_INT: slice(_HEADER + 28, _HEADER + 30),
 }
 """Position of a command's number in its frame, after seven fields of four bytes."""
 
@@ -193,10 +191,10 @@ def command_of(frame: bytes) -> int | None:
 
 def acknowledged(frame: bytes) -> int | None:
     """Return the command number of a final COMMAND_ACK, None for any other MAVLink 2 frame."""
-    if int.from_bytes(frame[7:10], "little") != dialect.MAVLINK_MSG_ID_COMMAND_ACK:
+    if int.from_bytes(frame[7:10], "little") != codec.dialect.MAVLINK_MSG_ID_COMMAND_ACK:
         return None
     payload = frame[_HEADER : _HEADER + frame[1]].ljust(3, b"\0")
-    if payload[2] == dialect.MAV_RESULT_IN_PROGRESS:
+    if payload[2] == codec.dialect.MAV_RESULT_IN_PROGRESS:
         return None
     return int.from_bytes(payload[:2], "little")
 

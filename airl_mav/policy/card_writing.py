@@ -17,9 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.errors import UsageError, usage_errors
-from airl_mav.core.fields import validated
-from airl_mav.core.files import replace_file, write_json
+from airl_mav.core import errors, fields, files
 from airl_mav.policy.actions import ActionSpec
 from airl_mav.policy.card import (
     ACTION,
@@ -155,7 +153,7 @@ def write_card(folder: Path, card: PolicyCard) -> None:
     if card.torch_sha256 is not None:
         read_torch_program(folder, card)
     plain = {"schema": SCHEMA, **card.model_dump(mode="json")}
-    write_json(folder / CARD_FILE, plain)
+    files.write_json(folder / CARD_FILE, plain)
     write_model_card(folder, card)
 
 
@@ -163,7 +161,7 @@ def write_model_card(folder: Path, card: PolicyCard) -> None:
     """Write the page of a card, unless the folder has a page that was not generated."""
     page = folder / MODEL_CARD_FILE
     if not page.exists() or MARK.encode() in page.read_bytes():
-        replace_file(page, model_card(card).encode())
+        files.replace_file(page, model_card(card).encode())
 
 
 def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
@@ -191,16 +189,16 @@ def copy_policy(
     """
     card = load_card(source, trust=trust)
     if out.resolve() == source.resolve():
-        raise UsageError(f"{out}: accepted: another folder than the policy's own")
+        raise errors.UsageError(f"{out}: accepted: another folder than the policy's own")
     if out.exists() and not out.is_dir():
-        raise UsageError(f"{out}: not a folder")
+        raise errors.UsageError(f"{out}: not a folder")
     plain = card.model_dump(mode="json") | {"results": ()} | changes
-    copied = validated(PolicyCard, plain)
-    with usage_errors(out):
+    copied = fields.validated(PolicyCard, plain)
+    with errors.usage_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-        replace_file(out / ONNX_FILE, read_model(source, card))
+        files.replace_file(out / ONNX_FILE, read_model(source, card))
         if card.torch_sha256 is not None:
-            replace_file(out / TORCH_FILE, read_torch_program(source, card))
+            files.replace_file(out / TORCH_FILE, read_torch_program(source, card))
         write_card(out, copied)
         if card.torch_sha256 is None:
             (out / TORCH_FILE).unlink(missing_ok=True)
@@ -261,12 +259,12 @@ def write_template(
     shape, vectors = spec.image_shape, _vector_inputs(spec)
     size = template_size(layers, filters, *shape, outputs, spec.channels, vectors)
     if 4 * size.parameters > GREATEST_BYTES:
-        raise UsageError(
+        raise errors.UsageError(
             f"--network {layers}x{filters}: {size.parameters:,} parameters; accepted: at most "
             f"{GREATEST_BYTES // 4:,} (a smaller --image has fewer)"
         )
     model = build_template(layers, filters, spec, facts.actions, rng)
-    replace_file(folder / ONNX_FILE, model)
+    files.replace_file(folder / ONNX_FILE, model)
     card = PolicyCard(
         **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
         sha256=digest(model),

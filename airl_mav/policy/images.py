@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MAX_MM, MM_PER_M
-from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera import frame, intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
 from airl_mav.policy.observation import Observation
@@ -90,8 +89,8 @@ def nearest_returns(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> ND
 
 def _depths_m(range_m: float) -> NDArray[np.float64]:
     """Return the depth [m] of every value of `nearest_returns`; infinite beyond the range."""
-    depth = (np.arange(MAX_MM + 1) + 1) / MM_PER_M
-    depth[(depth > range_m) | (np.arange(MAX_MM + 1) == MAX_MM)] = np.inf
+    depth = (np.arange(frame.MAX_MM + 1) + 1) / frame.MM_PER_M
+    depth[(depth > range_m) | (np.arange(frame.MAX_MM + 1) == frame.MAX_MM)] = np.inf
     return depth
 
 
@@ -100,8 +99,8 @@ def body_bytes(range_m: float) -> Bytes:
     """Return bytes proportional to depth: 0 is at the lens, 255 at the range and beyond."""
     share = np.minimum(_depths_m(range_m) / range_m, 1.0)
     table = np.rint(255.0 * share).astype(np.uint8)
-    far_mm = range_m * MM_PER_M
-    values = np.arange(1, MAX_MM + 2).astype(np.float32)
+    far_mm = range_m * frame.MM_PER_M
+    values = np.arange(1, frame.MAX_MM + 2).astype(np.float32)
     ratios = np.float32(255.0) * values / np.float32(far_mm)
     in_single = np.rint(np.minimum(ratios, np.float32(255.0))).astype(np.uint8)
     return Bytes(table, far_mm if np.array_equal(in_single, table) else 0.0)
@@ -170,7 +169,7 @@ class Scanning(NamedTuple):
 
 
 @cache
-def rays_of(camera: Intrinsics) -> ScanRays:
+def rays_of(camera: intrinsics.Intrinsics) -> ScanRays:
     """Return the rays of a pinhole or cylindrical camera. Raises UsageError for a fisheye."""
     if camera.model.tabled:
         raise UsageError(
@@ -195,7 +194,7 @@ def level_scan(depth_mm: NDArray[np.uint16], rays: ScanRays, tilt: Tilt, bearing
     view to the right. Infinite = no return.
     """
     sr, cr, sp, cp = (np.asarray(each)[:, None, None] for each in tilt)
-    depth = depth_mm / MM_PER_M
+    depth = depth_mm / frame.MM_PER_M
     ahead, right, down = depth * rays.forward, depth * rays.right, depth * rays.down[:, None]
     below = sr * right + cr * down
     high = cp * below - sp * ahead

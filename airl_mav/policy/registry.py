@@ -18,9 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import CommandKind
-from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.plugins import POLICIES as DOOR
+from airl_mav.core import constants, errors, plugins
 from airl_mav.core.plugins import announced, digest_of, load_part, names_code, reference
 from airl_mav.policy.actions import (
     Action,
@@ -79,7 +77,7 @@ class LearnedPolicy:
         """
         if ablate is not None and ablate not in boxes(card.observation):
             known = ", ".join(boxes(card.observation))
-            raise UsageError(f"ablate = {ablate!r}: accepted: {known}")
+            raise errors.UsageError(f"ablate = {ablate!r}: accepted: {known}")
         self.card = card
         self._runtime = runtime
         self._rng = rng
@@ -95,7 +93,7 @@ class LearnedPolicy:
         return self.card.name
 
     @property
-    def commands(self) -> CommandKind:
+    def commands(self) -> constants.CommandKind:
         """Command kind of the actions."""
         return self.card.actions.commands
 
@@ -124,7 +122,7 @@ class LearnedPolicy:
             lenses = {name: each.intrinsics for name, each in further.items()}
             reason = self.refuses(observation.intrinsics) or self.refuses_further(lenses)
             if reason is not None:
-                raise UsageError(f"policy {self.card.name}: {reason}")
+                raise errors.UsageError(f"policy {self.card.name}: {reason}")
             self._fitting = looks
         encoded = encode_layout(self.card.observation, observation.rows(None))
         return command(self.card.actions, self.act_batch(encoded)[0])
@@ -214,7 +212,7 @@ def load_learned(
         outputs = network.infer(blank)
     found, wanted = outputs.shape, (1, outputs_of(card.actions))
     if found != wanted:
-        raise UsageError(f"policy {card.name}: output {found}; accepted: {wanted}")
+        raise errors.UsageError(f"policy {card.name}: output {found}; accepted: {wanted}")
     return policy
 
 
@@ -232,14 +230,14 @@ def open_network(
     program = read_torch_program(folder, card)
     shipped = folder.resolve().is_relative_to((profiles_dir() / "policies").resolve())
     if not (trust or shipped):
-        raise UsageError(
+        raise errors.UsageError(
             f"{folder}: its {TORCH_FILE} can run any code on this machine; accepted: with --trust, "
             "if you trust its maker, or with the onnx runtime"
         )
     try:
         return TorchRuntime(program, card.observation, threads, card.state)
     except ValueError as error:
-        raise UsageError(f"{folder / TORCH_FILE}: {error}") from None
+        raise errors.UsageError(f"{folder / TORCH_FILE}: {error}") from None
 
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
@@ -264,7 +262,7 @@ class PolicyInfo:
     """Folder of a learned policy."""
     program: str | None = None
     """FILE.py:CLASS or MODULE:CLASS of a Python policy."""
-    asked: CommandKind | None = None
+    asked: constants.CommandKind | None = None
     """Command kind of a policy that another program runs."""
 
     @property
@@ -275,7 +273,7 @@ class PolicyInfo:
         return None if self.card is None else self.card.sha256
 
     @property
-    def commands(self) -> CommandKind:
+    def commands(self) -> constants.CommandKind:
         """Command kind. Raises FieldError if a custom class declares an unknown kind."""
         if self.asked is not None:
             return self.asked
@@ -323,7 +321,7 @@ def find_policy(name: str, *, trust: bool = False) -> PolicyInfo:
         return PolicyInfo(name, POLICIES[name][0])
     folder = _folder(name)
     if folder is None:
-        return PolicyInfo(name, _summary(name), program=announced(DOOR)[name])
+        return PolicyInfo(name, _summary(name), program=announced(plugins.POLICIES)[name])
     card = load_card(folder, trust=trust)
     return PolicyInfo(card.name, card.description, card, folder)
 
@@ -357,7 +355,7 @@ def load_policy(
         )
     for field, value in (("runtime", None if runtime == "onnx" else runtime), ("ablate", ablate)):
         if value is not None:
-            raise FieldError(field, value, f"for a learned policy; {known.name} is none")
+            raise errors.FieldError(field, value, f"for a learned policy; {known.name} is none")
     if known.program is not None:
         made: Policy = _policy_class(known.program)()
         return made
@@ -376,10 +374,10 @@ def _folder(name: str) -> Path | None:
     path = Path(name)
     if path.is_dir():
         return path
-    if reference(DOOR, name) is not None:
+    if reference(plugins.POLICIES, name) is not None:
         return None
-    known = ", ".join([*policy_names(), *announced(DOOR)])
-    raise UsageError(
+    known = ", ".join([*policy_names(), *announced(plugins.POLICIES)])
+    raise errors.UsageError(
         f"--policy {name!r}: no such policy; known: {known}"
         f" (or a path to a folder with {ONNX_FILE} and {CARD_FILE}, FILE.py:CLASS or MODULE:CLASS)"
     )
@@ -387,7 +385,7 @@ def _folder(name: str) -> Path | None:
 
 def _policy_class(name: str) -> Any:
     """Return a policy's class by FILE.py:CLASS, MODULE:CLASS or entry-point name."""
-    return load_part(DOOR, name, lambda made: callable(getattr(made, "act", None)))
+    return load_part(plugins.POLICIES, name, lambda made: callable(getattr(made, "act", None)))
 
 
 def _summary(name: str) -> str:

@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, get_a
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.addons import entries
-from airl_mav.core.errors import FieldError
+from airl_mav.core import addons, errors
 
 if TYPE_CHECKING:
     from airl_mav.camera.intrinsics import Intrinsics
@@ -35,7 +34,7 @@ CameraKind = Literal["depth", "rgb", "grey"]
 """`depth`: uint16 (h, w), Z16 in millimetres. `rgb`: uint8 (h, w, 3), sRGB. `grey`: uint8
 (h, w, 1), luma of the sRGB numbers."""
 
-SLOW: Final = frozenset(entries("airl_mav", "RENDERERS"))
+SLOW: Final = frozenset(addons.entries("airl_mav", "RENDERERS"))
 """Renderers of add-ons, which need longer than a tick for an image."""
 
 if TYPE_CHECKING:
@@ -400,7 +399,7 @@ def check_fov(field: str, projection: Projection, horizontal_fov_deg: float) -> 
         return
     limits = [f"{model.accepted_fov} with {name!r}" for name, model in PROJECTIONS.items()]
     accepted = ", ".join(limits).replace(" with ", " with projection ", 1)
-    raise FieldError(field, horizontal_fov_deg, accepted)
+    raise errors.FieldError(field, horizontal_fov_deg, accepted)
 
 
 def check_distortion(
@@ -411,12 +410,12 @@ def check_distortion(
         return
     shown = [float(each) for each in k]
     if not PROJECTIONS[projection].distorted_magic:
-        raise FieldError(
+        raise errors.FieldError(
             field, shown, f"left out with projection {projection!r}, only of a fisheye"
         )
     reached_deg, half_deg = math.degrees(sees_to(k)), 0.5 * horizontal_fov_deg
     if reached_deg < half_deg:
-        raise FieldError(
+        raise errors.FieldError(
             field,
             shown,
             "coefficients with which theta_d increases over the whole field of view, to"

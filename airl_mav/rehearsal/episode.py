@@ -21,9 +21,7 @@ from airl_mav.flight.trajectory import Trajectory, measure_quality
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
 from airl_mav.profiles.projections import SLOW
-from airl_mav.rehearsal.channel import Ended, Loaded, State
-from airl_mav.rehearsal.process_pair import ProcessFaults
-from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
+from airl_mav.rehearsal import channel, process_pair, run_folder
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.link_interface import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
@@ -109,18 +107,18 @@ class RunningEpisode:
 
     index: int
     seed: int
-    loaded: Loaded
+    loaded: channel.Loaded
     supervisor: EpisodeSupervisor
     stopwatch: WallClock
-    faults: ProcessFaults
+    faults: process_pair.ProcessFaults
     notes: list[str]
     wall_us: int | None = None
     """Wall time from reset to verdict [µs]."""
     paused_us: int = 0
     """Time that the firmware was suspended by faults during the episode [simulated µs]."""
-    state: State | None = None
-    verdict_state: State | None = None
-    ended: Ended | None = None
+    state: channel.State | None = None
+    verdict_state: channel.State | None = None
+    ended: channel.Ended | None = None
     navigating_us: int | None = None
     """Start of navigation by the companion's clock, which does not skip time [µs]."""
 
@@ -145,12 +143,12 @@ class RunningEpisode:
 
 def join_episode(
     episode: RunningEpisode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
-) -> FlownEpisode:
+) -> run_folder.FlownEpisode:
     """Join both processes' outputs of a judged episode; the companion's log may be missing."""
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
     latency = part_of(arrays, "estimate", keep_prefix=True)
-    latency[TICK_LATENESS] = arrays["tick/lateness_us"]
+    latency[run_folder.TICK_LATENESS] = arrays["tick/lateness_us"]
     if decisions_path.exists():
         latency |= join_stamps(
             _read(decisions_path), part_of(arrays, "setpoints"), arrays["tick/slips_us"]
@@ -165,7 +163,7 @@ def join_episode(
         slipped_us=max(0, record.slipped_us - episode.paused_us),
         wall_s=wall_s,
         speed=scenario.speed,
-        lateness_us=latency[TICK_LATENESS],
+        lateness_us=latency[run_folder.TICK_LATENESS],
         decisions=latency,
         frame_period_us=scenario.vehicle.camera.period_us,
         excused=_excused(record, scenario),
@@ -178,7 +176,7 @@ def join_episode(
     if episode.ended is not None and episode.ended.by_hand:
         notes, invalid = (*record.notes, judge.BY_HAND), (*record.invalid, judge.BY_HAND)
         record = replace(record, notes=notes, invalid=invalid)
-    return FlownEpisode(record, trajectory, latency)
+    return run_folder.FlownEpisode(record, trajectory, latency)
 
 
 def _slow_images(scenario: ResolvedScenario) -> bool:

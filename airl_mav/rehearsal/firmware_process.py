@@ -30,18 +30,13 @@ from airl_mav.profiles.vehicle import VehicleProfile, check_spread, equipped
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.channel import State
 from airl_mav.rehearsal.live_view import view_part
+from airl_mav.scenario import checks, resolve, stand_alone
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.checks import check_fitted
-from airl_mav.scenario.resolve import ResolvedScenario
-from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.commander import FlightPhase
+from firmware_sim import fault_timeline, interfaces
+from firmware_sim.autopilot import autopilot_state, commander
+from firmware_sim.external import parameters, programs
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware
-from firmware_sim.external.parameters import KeptParameters
-from firmware_sim.external.programs import how_to_start
-from firmware_sim.fault_timeline import FailingLink, FaultTimeline, failing_link
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack, fly
-from firmware_sim.interfaces import FirmwareLostError
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_device_links, bind_udp_links
 from firmware_sim.mavlink.server import udp_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
@@ -91,11 +86,11 @@ def build_firmware(
     signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
     insecure = insecure or signing is not None
     flight_stack: FlightStack
-    failing: FailingLink | None = None
+    failing: fault_timeline.FailingLink | None = None
     if aircraft.firmware == "builtin":
         links = ends()
         if link_fails(aircraft.faults):
-            failing = failing_link(links.api, pacing.clock)
+            failing = fault_timeline.failing_link(links.api, pacing.clock)
         try:
             devices = bind_devices()
         except UsageError:
@@ -105,7 +100,7 @@ def build_firmware(
         server = udp_server(
             links, unix_us(), pacing.clock, signing, onboard=failing, devices=devices
         )
-        keeper = None if parameters_file is None else KeptParameters(parameters_file)
+        keeper = None if parameters_file is None else parameters.KeptParameters(parameters_file)
         flight_stack = BuiltinFlightStack(server, keeper)
     else:
         flight_stack = real_firmware(FirmwareRequest(aircraft, vehicle, log, ends))
@@ -124,7 +119,7 @@ class Service:
         self,
         firmware: Firmware,
         harness: channel.ChildChannel,
-        scenario: ResolvedScenario,
+        scenario: resolve.ResolvedScenario,
         tap: Any = None,
     ) -> None:
         """Store firmware, harness, scenario and view, and register callbacks."""
@@ -199,7 +194,7 @@ class Service:
         self._reported = period
         self._harness.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
 
-    def _tell_faults(self, timeline: FaultTimeline, now_us: int) -> None:
+    def _tell_faults(self, timeline: fault_timeline.FaultTimeline, now_us: int) -> None:
         """Report process faults that begin or end."""
         acting = {each.number: each.fault for each in timeline.acting(*PROCESSES)}
         if acting.keys() == self._due.keys():
@@ -212,7 +207,7 @@ class Service:
             self._harness.send(channel.Due(time_us=now_us, fault=str(fault), begins=begins))
         self._due = acting
 
-    def _tell(self, message: OperatorText) -> None:
+    def _tell(self, message: autopilot_state.OperatorText) -> None:
         simulation = self._firmware.simulation
         time_us = 0 if simulation is None else simulation.time_us
         self._harness.send(
@@ -255,18 +250,18 @@ class Listener:
     """Called while real firmware must be started by the user, with instructions."""
     ready: Callable[[str, Goal], None] = field(default=lambda _camera, _goal: None)
     """Called when the vehicle is ready, with the ZeroMQ address of its camera and the goal."""
-    text: Callable[[OperatorText], None] = field(default=lambda _message: None)
+    text: Callable[[autopilot_state.OperatorText], None] = field(default=lambda _message: None)
     """Called for a text of the autopilot."""
     say: Callable[[str], None] = field(default=lambda _line: None)
     """Called for each line of progress."""
 
 
 def fly_vehicle(
-    asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
+    asked: stand_alone.StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
 ) -> None:
     """Fly client commands until `stop`. Raises UsageError or FirmwareLostError."""
     listener = listener or Listener()
-    check_vehicle(asked)
+    stand_alone.check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
     ports: list[str] = []
 
@@ -295,7 +290,7 @@ def fly_vehicle(
         firmware.on_message = listener.text
         firmware.on_log_lost = listener.say
         warm_up(vehicle, asked.plant)
-        if (hint := how_to_start(asked, vehicle)) is not None:
+        if (hint := programs.how_to_start(asked, vehicle)) is not None:
             listener.waiting(hint)
         firmware.load(episode, asked.tlog, unix_us())
         listener.ready(firmware.camera_endpoint, goal)
@@ -304,18 +299,18 @@ def fly_vehicle(
         fly(firmware, stop, asked.duration, listener.say)
 
 
-def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
+def aircraft_of(asked: stand_alone.StandAloneVehicle) -> tuple[VehicleProfile, float]:
     """Return the loaded vehicle and its computer's power [W]. Raises UsageError."""
     vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
     check_spread(vehicle, asked.spread)
     further = vehicle.cameras.values()
     check_noise(vehicle.camera, asked.sensors, asked.faults, further=further)
-    check_fitted(vehicle.sensors, asked.faults)
+    checks.check_fitted(vehicle.sensors, asked.faults)
     return vehicle, computer.onboard_watts
 
 
 def episode_of(
-    asked: StandAloneVehicle, vehicle: VehicleProfile, computer_w: float
+    asked: stand_alone.StandAloneVehicle, vehicle: VehicleProfile, computer_w: float
 ) -> tuple[EpisodeSetup, Goal]:
     """Return the episode of a loaded vehicle, and its goal. Raises UsageError without an arena."""
     spec = load_profile("arenas", asked.arena, ArenaSpec)
@@ -325,7 +320,7 @@ def episode_of(
     return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), arena.goal_point
 
 
-def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> EpisodeSetup:
+def episode_setup(resolved: resolve.ResolvedScenario, arena: Arena, seed: int) -> EpisodeSetup:
     """Return the setup of an episode in the arena of a seed."""
     hover = None
     if resolved.scenario.start == "hover":
@@ -354,11 +349,11 @@ def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0)
         battery=truth.battery_remaining,
         collision=collision,
         mode=flight.mode.name.lower(),
-        armed=flight.phase >= FlightPhase.GROUND,
-        landed=flight.phase < FlightPhase.AIR,
+        armed=flight.phase >= commander.FlightPhase.GROUND,
+        landed=flight.phase < commander.FlightPhase.AIR,
         slipped_us=slipped_us,
     )
 
 
 if __name__ == "__main__":
-    sys.exit(channel.serve(fly_requested, FirmwareLostError))
+    sys.exit(channel.serve(fly_requested, interfaces.FirmwareLostError))

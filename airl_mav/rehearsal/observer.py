@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Goal, goal_distance_m
+from airl_mav.core import constants, frames
 from airl_mav.core.progress import Event, Progress
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
@@ -39,7 +38,7 @@ class Observer:
     def waiting(self, what: str) -> None:
         """Called when the rehearsal waits for something."""
 
-    def episode(self, index: int, seed: int, goal: Goal) -> None:
+    def episode(self, index: int, seed: int, goal: frames.Goal) -> None:
         """Called when an episode begins; its goal is (north, east) [m]."""
 
     def phase(self, phase: str, time_us: int) -> None:
@@ -72,14 +71,14 @@ class LiveObserver(Observer):
         self._progress = progress
         self._tally = Tally(progress, "flights", folder, done, episodes)
         self._flight = ""
-        self._goal: Goal = (0.0, 0.0)
+        self._goal: frames.Goal = (0.0, 0.0)
         self._phase = ""
 
     def waiting(self, what: str) -> None:
         """Show the reason of a wait."""
         self._progress.status(what)
 
-    def episode(self, index: int, seed: int, goal: Goal) -> None:
+    def episode(self, index: int, seed: int, goal: frames.Goal) -> None:
         """Show that an episode begins."""
         self._goal = goal
         self._phase = "booting"
@@ -89,13 +88,14 @@ class LiveObserver(Observer):
     def phase(self, phase: str, time_us: int) -> None:
         """Show the phase."""
         self._phase = phase
-        self._progress.status(f"{self._flight}: {phase} at {time_us / US_PER_S:.1f} s")
+        self._progress.status(f"{self._flight}: {phase} at {time_us / constants.US_PER_S:.1f} s")
 
     def state(self, state: State, started_us: int) -> None:
         """Show the vehicle's true state."""
-        away = goal_distance_m(self._goal, state.position)
+        away = frames.goal_distance_m(self._goal, state.position)
+        flown_s = (state.time_us - started_us) / constants.US_PER_S
         self._progress.watch(
-            f"{self._flight}: {self._phase:<10} {(state.time_us - started_us) / US_PER_S:5.1f} s "
+            f"{self._flight}: {self._phase:<10} {flown_s:5.1f} s "
             f"{away:5.1f} m to goal {state.speed_m_s:4.1f} m/s "
             f"{-state.position[2]:4.1f} m high {100 * state.battery:3.0f} %"
         )

@@ -15,11 +15,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from airl_mav.core.child_process import GRACE_S, ChildProcess, Exited
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.machine import usable_cores
+from airl_mav.core import child_process, clock, constants, errors, machine
 from airl_mav.faults import Fault
 from airl_mav.rehearsal.channel import Begin, Compiling, Due, Event, Failed, Ready, parse_event
 
@@ -49,7 +45,7 @@ class LostError(Exception):
         self.what, self.detail = what, detail
 
 
-class Child(ChildProcess):
+class Child(child_process.ChildProcess):
     """One process of the pair; its events and its end arrive in a shared queue."""
 
     def __init__(
@@ -57,7 +53,7 @@ class Child(ChildProcess):
         name: str,
         module: str,
         log: Path,
-        events: queue.Queue[tuple[str, Event | Exited]],
+        events: queue.Queue[tuple[str, Event | child_process.Exited]],
         *,
         keeps: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
@@ -88,7 +84,7 @@ class Child(ChildProcess):
         """End the process; see `ChildProcess.stop`. All its events are then in the queue."""
         self.ending = True
         super().stop()
-        self._reader.join(GRACE_S)
+        self._reader.join(child_process.GRACE_S)
 
     def kill(self) -> None:
         """End the process at once, without waiting."""
@@ -108,12 +104,12 @@ class ProcessPair:
     """Two processes that fly together; after a loss a new pair replaces them."""
 
     def __init__(self) -> None:
-        self._events: queue.Queue[tuple[str, Event | Exited]] = queue.Queue()
+        self._events: queue.Queue[tuple[str, Event | child_process.Exited]] = queue.Queue()
         self._children: dict[str, Child] = {}
         self._scratch = ""
         """Folder of the companion's temporary files. MAVSDK creates one folder per system, and
         leaves it behind when its process is killed."""
-        self._clock = WallClock()
+        self._clock = clock.WallClock()
         self._suspended: dict[str, tuple[int, int | None]] = {}
         """Start and end of the suspension by process [wall µs]; end None: until `resume`."""
         self._suspended_us: dict[str, int] = {}
@@ -142,7 +138,7 @@ class ProcessPair:
                     compiling()
             return len(ready) == len(self._children)
 
-        busy = max(1.0, os.getloadavg()[0] / usable_cores())
+        busy = max(1.0, os.getloadavg()[0] / machine.usable_cores())
         limit_s = READY_TIMEOUT_S * busy
         self.pump(note, limit_s, "both processes to be ready", lambda: bool(compiles))
 
@@ -173,7 +169,7 @@ class ProcessPair:
     def suspend(self, name: str, for_s: float | None = None) -> None:
         """Suspend a process, like a hanging computer, for some wall time [s] or until `resume`."""
         now_us = self._clock.time_us()
-        until_us = None if for_s is None else now_us + round(for_s * US_PER_S)
+        until_us = None if for_s is None else now_us + round(for_s * constants.US_PER_S)
         self._children[name].suspend()
         self._suspended[name] = now_us, until_us
 
@@ -231,20 +227,20 @@ class ProcessPair:
         LostError if a process died or failed, or after the timeout [wall s]; `what` describes the
         expected event.
         """
-        since = WallClock()
+        since = clock.WallClock()
         paused_us = before_us = 0
         while True:
             now_us = since.time_us()
             paused_us += now_us - before_us if paused() else 0
             before_us = now_us
-            left_s = timeout_s - (now_us - paused_us) / US_PER_S
+            left_s = timeout_s - (now_us - paused_us) / constants.US_PER_S
             if left_s <= 0.0:
                 raise LostError(f"gave up waiting for {what} after {timeout_s:.0f} s")
             try:
                 name, event = self._events.get(timeout=min(left_s, self._look_s()))
             except queue.Empty:
                 continue
-            if isinstance(event, Exited):
+            if isinstance(event, child_process.Exited):
                 self._died(name, event)
             elif isinstance(event, Failed):
                 self._failed(name, event)
@@ -253,7 +249,7 @@ class ProcessPair:
 
     def _look_s(self) -> float:
         """Resume processes whose suspension is over; return the time to the next check [wall s]."""
-        now_us, look_us = self._clock.time_us(), round(LOOK_S * US_PER_S)
+        now_us, look_us = self._clock.time_us(), round(LOOK_S * constants.US_PER_S)
         for name, (_, until_us) in list(self._suspended.items()):
             if until_us is None:
                 continue
@@ -261,15 +257,15 @@ class ProcessPair:
                 self.resume(name)
             else:
                 look_us = min(look_us, until_us - now_us)
-        return look_us / US_PER_S
+        return look_us / constants.US_PER_S
 
     def _failed(self, name: str, event: Failed) -> None:
         self._children[name].ending = True
         if event.usage:
-            raise UsageError(event.message)
+            raise errors.UsageError(event.message)
         raise LostError(f"the {name} gave up: {event.message}")
 
-    def _died(self, name: str, exited: Exited) -> None:
+    def _died(self, name: str, exited: child_process.Exited) -> None:
         child = self._children[name]
         if child.ending:
             return
@@ -310,7 +306,7 @@ class ProcessFaults:
     def carry_out(self, due: Due) -> str | None:
         """Begin or end a fault; return a note for the records, or None."""
         fault = Fault.model_validate(due.fault)
-        name, kind, at_s = fault.part, fault.kind, due.time_us / US_PER_S
+        name, kind, at_s = fault.part, fault.kind, due.time_us / constants.US_PER_S
         if name in self._out:
             return None
         if not due.begins:

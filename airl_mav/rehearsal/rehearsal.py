@@ -14,7 +14,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import BY_HAND, Referee, TruthSample, Verdict
-from airl_mav.rehearsal import channel, process_pair
+from airl_mav.rehearsal import channel, live_view, process_pair, run_folder
 from airl_mav.rehearsal.episode import (
     TAKEOFF_LIMIT_S,
     EpisodeSupervisor,
@@ -24,9 +24,7 @@ from airl_mav.rehearsal.episode import (
     disturbing,
     join_episode,
 )
-from airl_mav.rehearsal.live_view import ViewAddresses
 from airl_mav.rehearsal.observer import FLOWN_AGAIN, WARNING, Observer
-from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolve import ResolvedScenario
 from firmware_sim.external.programs import load_timeout_s
 
@@ -46,10 +44,10 @@ class Rehearsal:
     def __init__(
         self,
         scenario: ResolvedScenario,
-        folder: RunFolder,
+        folder: run_folder.RunFolder,
         observer: Observer,
         keeps: Sequence[int] = (),
-        view: ViewAddresses | None = None,
+        view: live_view.ViewAddresses | None = None,
     ) -> None:
         """Take the scenario without starting it. The processes inherit the locks in `keeps`."""
         self._view = view
@@ -108,7 +106,7 @@ class Rehearsal:
             # Stored before the start, so that an interrupt still ends it.
             self._pair = pair = process_pair.ProcessPair()
             self._observer.waiting("starting firmware and companion")
-            log = (self._folder.path / FIRMWARE_PRINTS).absolute()
+            log = (self._folder.path / run_folder.FIRMWARE_PRINTS).absolute()
             begin = channel.Begin(scenario=self._scenario, log=str(log), view=self._view)
             pair.start(
                 begin, self._folder.path, self._keeps, lambda: self._observer.waiting(COMPILING)
@@ -132,7 +130,7 @@ class Rehearsal:
         for path in self._left_by(index):
             path.unlink(missing_ok=True)
 
-    def _fly(self, index: int, seed: int, notes: Sequence[str]) -> FlownEpisode:
+    def _fly(self, index: int, seed: int, notes: Sequence[str]) -> run_folder.FlownEpisode:
         """Fly an episode. Raises LostError if it fails."""
         pair, scenario, folder = self._present(), self._scenario, self._folder
         record_path, decisions_path = self._left_by(index)

@@ -16,11 +16,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.core.constants import US_PER_MS
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import read_typed, replace_file, write_json
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.statistics import Estimate
+from airl_mav.core import constants, errors, files
+from airl_mav.flight import judge, statistics
 from airl_mav.latency.stages import MIN_SAMPLES, Summary
 
 if TYPE_CHECKING:
@@ -118,7 +115,7 @@ class Document:
 
 def estimate_headline(
     title: str,
-    estimate: Estimate,
+    estimate: statistics.Estimate,
     unit: str,
     *,
     digits: int,
@@ -182,10 +179,10 @@ def draw_section(section: Section, folder: Path) -> tuple[Section, tuple[FigureI
     pictures = () if section.draw is None else tuple(section.draw())
     if section.sheet and pictures:
         columns = section.columns or (2 if len(pictures) == 4 else SHEET_COLUMNS)
-        replace_file(folder / section.sheet, montage(pictures, columns))
+        files.replace_file(folder / section.sheet, montage(pictures, columns))
     else:
         for picture in pictures:
-            replace_file(folder / f"{picture.name}.png", picture.png)
+            files.replace_file(folder / f"{picture.name}.png", picture.png)
     return section, pictures
 
 
@@ -194,12 +191,12 @@ def write_document(document: Document, folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = [draw_section(section, folder) for section in document.sections]
-        replace_file(folder / f"{document.name}.md", markdown(document).encode())
+        files.replace_file(folder / f"{document.name}.md", markdown(document).encode())
         template = environment().get_template("document.html.j2")
         path = folder / f"{document.name}.html"
-        replace_file(path, template.render(document=document, sections=drawn).encode())
+        files.replace_file(path, template.render(document=document, sections=drawn).encode())
     except OSError as error:
-        raise UsageError(f"{folder}: {error.strerror}") from None
+        raise errors.UsageError(f"{folder}: {error.strerror}") from None
     return path
 
 
@@ -272,19 +269,19 @@ TOO_FEW_NOTE = (
 )
 
 OUTCOME_LABELS = {
-    Outcome.SUCCESS: "goal reached",
-    Outcome.COLLISION: "collision",
-    Outcome.TIMEOUT: "time limit",
-    Outcome.BATTERY: "battery empty",
-    Outcome.ABORTED: "aborted",
+    judge.Outcome.SUCCESS: "goal reached",
+    judge.Outcome.COLLISION: "collision",
+    judge.Outcome.TIMEOUT: "time limit",
+    judge.Outcome.BATTERY: "battery empty",
+    judge.Outcome.ABORTED: "aborted",
 }
 
 STYLES = {
-    OUTCOME_LABELS[Outcome.SUCCESS]: "green",
-    OUTCOME_LABELS[Outcome.COLLISION]: "red",
-    OUTCOME_LABELS[Outcome.TIMEOUT]: "yellow",
-    OUTCOME_LABELS[Outcome.BATTERY]: "magenta",
-    OUTCOME_LABELS[Outcome.ABORTED]: "dim",
+    OUTCOME_LABELS[judge.Outcome.SUCCESS]: "green",
+    OUTCOME_LABELS[judge.Outcome.COLLISION]: "red",
+    OUTCOME_LABELS[judge.Outcome.TIMEOUT]: "yellow",
+    OUTCOME_LABELS[judge.Outcome.BATTERY]: "magenta",
+    OUTCOME_LABELS[judge.Outcome.ABORTED]: "dim",
     TOO_FEW_CELL: "dim",
     NONE: "dim",
 }
@@ -323,7 +320,7 @@ class TableView:
 
 def ms(value_us: float | None, digits: int = 2) -> str:
     """Return a duration [µs] as milliseconds."""
-    return NONE if value_us is None else f"{value_us / US_PER_MS:,.{digits}f}"
+    return NONE if value_us is None else f"{value_us / constants.US_PER_MS:,.{digits}f}"
 
 
 def percentile_cell(value_us: float | None, n: int) -> str:
@@ -453,16 +450,16 @@ def write_table(
     saved = SavedTable(view.title, columns, view.rows, view.notes, tuple(policies), made)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / TABLE_FILE
-    write_json(path, {"schema": SCHEMA, **asdict(saved)})
+    files.write_json(path, {"schema": SCHEMA, **asdict(saved)})
     return path
 
 
 def read_table(folder: Path) -> SavedTable:
     """Read the table of a folder. Raises UsageError if it is missing or damaged."""
-    return read_typed(folder / TABLE_FILE, _SAVED, SCHEMA, "table")
+    return files.read_typed(folder / TABLE_FILE, _SAVED, SCHEMA, "table")
 
 
-def with_interval(estimate: Estimate, digits: int = 1, sign: str = "") -> str:
+def with_interval(estimate: statistics.Estimate, digits: int = 1, sign: str = "") -> str:
     """Return an estimate with its 95 % interval in brackets; `sign` is "+" for differences."""
     if estimate.value is None:
         return NONE
@@ -473,7 +470,7 @@ def with_interval(estimate: Estimate, digits: int = 1, sign: str = "") -> str:
     return text
 
 
-def interval_of(estimate: Estimate, digits: int, sign: str = "") -> str:
+def interval_of(estimate: statistics.Estimate, digits: int, sign: str = "") -> str:
     """Return only the 95 % interval; empty without one."""
     if estimate.low is None or estimate.high is None:
         return ""

@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from airl_mav.flight.energy import EnergySplit, add_up, split_energy
-from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.trajectory import Quality
+from airl_mav.flight import energy, episode_record, judge, trajectory
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
@@ -64,10 +61,10 @@ def energy_section(page: ReportInput) -> tuple[Section, ...]:
 class FlightEnergy:
     """Energy of a flight from the start of navigation."""
 
-    record: EpisodeRecord
-    quality: Quality
+    record: episode_record.EpisodeRecord
+    quality: trajectory.Quality
     airframe_j: float
-    parts: EnergySplit | None
+    parts: energy.EnergySplit | None
     """Parts of the airframe's energy; None without the vehicle or the recording."""
 
     @property
@@ -81,7 +78,7 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
     watts = run.info.setup.computer_watts
     flights = []
     for e in run.episodes:
-        if e.quality is None or e.navigation_us is None or e.outcome is Outcome.ABORTED:
+        if e.quality is None or e.navigation_us is None or e.outcome is judge.Outcome.ABORTED:
             continue
         if e.quality.energy_j is None:
             continue
@@ -89,7 +86,7 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
         parts = (
             None
             if path is None or vehicle is None or len(path) < 2
-            else split_energy(path, e.navigation_us, e.ended_us, vehicle, watts)
+            else energy.split_energy(path, e.navigation_us, e.ended_us, vehicle, watts)
         )
         flights.append(FlightEnergy(e, e.quality, e.quality.energy_j, parts))
     return flights
@@ -113,7 +110,7 @@ def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) ->
         )
     ]
     if splits and len(splits) == len(flights):
-        split = add_up(splits)
+        split = energy.add_up(splits)
         lines += [(f"– {title}", getattr(split, name)) for name, title in AIRFRAME.items()]
         notes.append(
             "The airframe's parts follow its power model. Hovering: staying up, with the payload. "

@@ -7,10 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from airl_mav.core.constants import MS_PER_S, US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.flight import statistics
-from airl_mav.flight.judge import Outcome
+from airl_mav.core import constants, errors
+from airl_mav.flight import judge, statistics, trajectory
 from airl_mav.flight.statistics import (
     Aggregate,
     Change,
@@ -19,7 +17,6 @@ from airl_mav.flight.statistics import (
     known,
     successful,
 )
-from airl_mav.flight.trajectory import BANDWIDTH_HZ, command_steps
 from airl_mav.latency.stages import (
     ALL_STAGES,
     SETPOINT_TO_MOTOR,
@@ -191,8 +188,8 @@ def summarize_run(run: LoadedRun) -> RunSummary:
 CONDUCT_NOTE = (
     "Deadline misses: decisions that took effect later than the hold time after their frame was "
     "exposed, or never; of all valid flights, the rest of those that reached the goal. Jerk: "
-    f"sampled at 50 Hz, Gaussian low-pass of {BANDWIDTH_HZ:g} Hz; that of the command is its steps "
-    "seen through the same filter."
+    f"sampled at 50 Hz, Gaussian low-pass of {trajectory.BANDWIDTH_HZ:g} Hz; that of the command "
+    "is its steps seen through the same filter."
 )
 
 
@@ -206,7 +203,7 @@ class Budget:
 
     def row(self, t2_us: Samples) -> tuple[str, ...]:
         """Return the share of inference times (n,) [µs] above the budget."""
-        ratio = deadline_miss_ratio(t2_us, max(1.0, self.t2_s * US_PER_S))
+        ratio = deadline_miss_ratio(t2_us, max(1.0, self.t2_s * constants.US_PER_S))
         told = NONE if ratio is None else f"{100.0 * ratio:.1f} %"
         return "t2 beyond the safe velocity's", told, NONE, f"{t2_us.size:,}"
 
@@ -219,7 +216,7 @@ def _budget(run: LoadedRun) -> Budget | None:
     try:
         card = find_policy(run.info.config["policy"]).card
         vehicle = vehicle_of(run.info)
-    except (KeyError, UsageError):
+    except (KeyError, errors.UsageError):
         return None
     trained = {} if card is None else card.training.config.get("environment", {})
     bound, pilot = trained.get("safe_velocity"), run.info.config.get("pilot")
@@ -228,7 +225,7 @@ def _budget(run: LoadedRun) -> Budget | None:
     distance_m, speed_m_s = bound["sensing_distance_m"], pilot["max_speed_m_s"]
     task = StoppingTask(vehicle, DecisionLoop.of(vehicle, pilot["hold_s"]), distance_m)
     t2_s = task.inference_budget_s(speed_m_s)
-    allowed = f"{MS_PER_S * t2_s:.0f} ms" if t2_s > 0.0 else "none"
+    allowed = f"{constants.MS_PER_S * t2_s:.0f} ms" if t2_s > 0.0 else "none"
     return Budget(
         t2_s,
         f"At {speed_m_s:.2f} m/s, its fastest action, the policy stops for what comes up "
@@ -241,11 +238,11 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
     q = summary.quality
     if not any(measure.of(q).n for measure in CONDUCT):
         return None
-    reached = [e for e in run.episodes if e.outcome is Outcome.SUCCESS and not e.invalid]
+    reached = [e for e in run.episodes if e.outcome is judge.Outcome.SUCCESS and not e.invalid]
     good = successful(reached)
     command_rms = known(good, "command_jerk_rms_m_s3")
     steps = np.concatenate(
-        [np.zeros(0), *(command_steps(run.latency.get(e.index, {})) for e in reached)]
+        [np.zeros(0), *(trajectory.command_steps(run.latency.get(e.index, {})) for e in reached)]
     )
     p95, n = percentile(steps, 95.0), f"{steps.size:,}"
     tail = f"{p95:.2f} m/s" if p95 is not None else TOO_FEW_CELL if steps.size else NONE

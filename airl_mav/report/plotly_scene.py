@@ -17,15 +17,12 @@ from numpy.typing import NDArray
 from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.triangles import drawn, standing
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import goal_height_m, quats_to_euler
+from airl_mav.core import constants, frames
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, flown_path
-from airl_mav.report.document import OUTCOME_LABELS
-from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
-from airl_mav.report.scene import GLASS_OPACITY
+from airl_mav.report import document, run_figures, scene
 
 POINTS = 240
 """Maximum number of points of a path."""
@@ -103,7 +100,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
     ground = None if arena is None else arena.ground
     below = np.zeros(len(place)) if ground is None else ground.heights_at(path.position)
     shadow = np.column_stack([place[:, :2], below + 0.05])
-    seconds = (path.time_us - record.started_us) / US_PER_S
+    seconds = (path.time_us - record.started_us) / constants.US_PER_S
     moving: dict[str, Any] | None = None
     traces = [] if arena is None else _arena_traces(arena)
     if arena is not None and arena.tours:
@@ -126,10 +123,10 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
         }
     east, north = record.goal[1], record.goal[0]
     base = 0.0 if ground is None else ground.height_at(north, east)
-    up = goal_height_m(record.goal) or base + 0.1
+    up = frames.goal_height_m(record.goal) or base + 0.1
     ring = _ring(east, north, record.goal_radius_m) + np.array([0.0, 0.0, base])
     speed_bar = {"title": {"text": "m/s"}, "thickness": 12, "len": 0.5, "x": 1.0}
-    scale = [[i / 15.0, to_hex(speed_colours()(i / 15.0))] for i in range(16)]
+    scale = [[i / 15.0, to_hex(run_figures.speed_colours()(i / 15.0))] for i in range(16)]
     traces += [
         _line(shadow, "#8d969f", "shadow", width=2),
         {
@@ -151,8 +148,8 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
         _marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"),
         _marks(
             place[-1:],
-            OUTCOME_COLOURS[record.outcome],
-            f"end: {OUTCOME_LABELS[record.outcome]}",
+            run_figures.OUTCOME_COLOURS[record.outcome],
+            f"end: {document.OUTCOME_LABELS[record.outcome]}",
             symbol="x" if record.outcome is not Outcome.SUCCESS else "circle",
         ),
         # The vehicle with the edges of its field of view; the page's script moves it.
@@ -168,10 +165,10 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
         "path": {
             "time": _rounded(seconds),
             "place": _rounded(place),
-            "heading": _rounded(np.unwrap(quats_to_euler(path.quaternion)[2])),
+            "heading": _rounded(np.unwrap(frames.quats_to_euler(path.quaternion)[2])),
             "speed": _rounded(speed),
         },
-        "navigation": round(since_us / US_PER_S, 2),
+        "navigation": round(since_us / constants.US_PER_S, 2),
         "vehicle": len(traces) - 1,
         "view": _view(fov_deg),
         "moving": moving,
@@ -190,7 +187,7 @@ def all_flights_view(
 ) -> dict[str, Any]:
     """Return the common view, coloured by outcome; obstacles only if the arena is `shared`."""
     traces = [] if arena is None else _arena_traces(arena, obstacles=shared)
-    for outcome in OUTCOME_COLOURS:
+    for outcome in run_figures.OUTCOME_COLOURS:
         records = [record for record in everyone if record.outcome is outcome]
         paths = [
             path for r in records if (path := flown_path(run, r)) is not None and len(path) > 1
@@ -200,13 +197,13 @@ def all_flights_view(
         thinned = [_east_north_up(_thinned(path, ALL_POINTS).position) for path in paths]
         # Gaps between paths allow one line for all of them.
         joined = [part for places in thinned for part in (*_rounded(places), [None] * 3)]
-        label = f"{OUTCOME_LABELS[outcome]} ({len(records)})"
-        line = _line(np.zeros((0, 3)), OUTCOME_COLOURS[outcome], label, width=3)
+        label = f"{document.OUTCOME_LABELS[outcome]} ({len(records)})"
+        line = _line(np.zeros((0, 3)), run_figures.OUTCOME_COLOURS[outcome], label, width=3)
         line |= {axis: [part[k] for part in joined] for k, axis in enumerate("xyz")}
         traces.append(line | {"showlegend": True})
         if outcome is not Outcome.SUCCESS:
             ends = np.stack([places[-1] for places in thinned])
-            traces.append(_marks(ends, OUTCOME_COLOURS[outcome], label, symbol="x"))
+            traces.append(_marks(ends, run_figures.OUTCOME_COLOURS[outcome], label, symbol="x"))
     traces.append(_marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"))
     return {"figure": {"data": traces, "layout": _layout()}, "path": None}
 
@@ -292,7 +289,7 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         if still:
             traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
         if panes:
-            traces.append(_mesh(panes, STILL_COLOUR, "glass", opacity=GLASS_OPACITY))
+            traces.append(_mesh(panes, STILL_COLOUR, "glass", opacity=scene.GLASS_OPACITY))
     return traces
 
 

@@ -17,19 +17,12 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import RANGE_M, Mount, camera_pose, expose
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import Arrays
-from airl_mav.core.frames import Goal
-from airl_mav.core.plugins import names_code
+from airl_mav.core import constants, errors, files, frames, plugins
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
-from airl_mav.policy import observation
+from airl_mav.policy import layouts, observation, observation_spec, registry
 from airl_mav.policy.actions import commands, discrete_actions
-from airl_mav.policy.layouts import encode_layout
-from airl_mav.policy.observation_spec import MOST_FRAMES
-from airl_mav.policy.registry import LearnedPolicy, find_policy, load_learned
 from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -87,7 +80,7 @@ class SeenDecision:
 class PolicyAgain:
     """Policy of a run, loaded for recomputing its decisions."""
 
-    policy: LearnedPolicy
+    policy: registry.LearnedPolicy
     actions: NDArray[np.float64]
     """Commands (k, 3) of the actions: forward, right [m/s], yaw rate [rad/s]. 3D action sets have
     (k, 4) with the downward speed [m/s] last."""
@@ -101,18 +94,18 @@ class PolicyAgain:
 def policy_again(info: RunInfo) -> PolicyAgain | None:
     """Return a run's policy if it has discrete actions, no code, and its file is unchanged."""
     name, digest = info.config.get("policy"), info.config.get("policy_sha256")
-    if not isinstance(name, str) or digest is None or names_code(name):
+    if not isinstance(name, str) or digest is None or plugins.names_code(name):
         return None
     try:
-        known = find_policy(name)
+        known = registry.find_policy(name)
         if known.folder is None or known.card is None or known.sha256 != digest:
             return None
         count = discrete_actions(known.card.actions)
         if count is None:
             return None
-        policy = load_learned(known.folder, known.card, ablate=info.config.get("ablate"))
+        policy = registry.load_learned(known.folder, known.card, ablate=info.config.get("ablate"))
         table = commands(known.card.actions, np.arange(count))
-    except UsageError:
+    except errors.UsageError:
         return None
     return PolicyAgain(policy, table)
 
@@ -152,13 +145,13 @@ def seen_decisions(
         setpoint = np.asarray(stamps[column][number], np.float64)
         scores = same = None
         if again is not None and policy is not None:
-            encoded = encode_layout(policy.card.observation, seen.rows(None))
+            encoded = layouts.encode_layout(policy.card.observation, seen.rows(None))
             scores = policy.outputs(encoded)[0]
             best = again.actions[int(np.argmax(scores))]
             flown = setpoint[[0, 1, 3, 2]][: len(best)]
             same = bool(np.abs(best - flown).max() < SAME_ACTION)
         yield SeenDecision(number, seen.image, scores, same)
-        stops = None if hover_s is None else sent + round((lasts_s + hover_s) * US_PER_S)
+        stops = None if hover_s is None else sent + round((lasts_s + hover_s) * constants.US_PER_S)
         companion.decided(setpoint, ready - began, sent, stops)
 
 
@@ -185,7 +178,7 @@ class _Further:
 
     def __init__(self, lens: PathCamera) -> None:
         self._lens = lens
-        self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
+        self._earlier: deque[NDArray[Any]] = deque(maxlen=observation_spec.MOST_FRAMES - 1)
 
     def view(self, time_us: int) -> observation.CameraView:
         """Return a decision's view with the image of a time; store the image for later ones."""
@@ -213,7 +206,7 @@ class _Companion:
         self,
         image: NDArray[Any],
         state: observation.Kinematics,
-        goal: Goal,
+        goal: frames.Goal,
         age_us: int,
         now_us: int,
         further: Mapping[str, observation.CameraView],
@@ -227,7 +220,7 @@ class _Companion:
             image, state = images[0], states.rows(0)
         told = self._memory.in_flight(age).rows(0)
         earlier = self._earlier
-        self._earlier = ((image, state), *earlier)[: MOST_FRAMES - 1]
+        self._earlier = ((image, state), *earlier)[: observation_spec.MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
         return observation.observe(image, self._intrinsics, state, where, told, earlier, further)
 
@@ -243,7 +236,7 @@ class _Companion:
         self._compensator.decided(ONE, command, t2, np.array([sent_us]), stops)
 
 
-def _telemetry(stamps: Arrays, path: Trajectory, time_us: int) -> observation.Kinematics:
+def _telemetry(stamps: files.Arrays, path: Trajectory, time_us: int) -> observation.Kinematics:
     """Return the newest estimate at a time, or the true state without recorded estimates."""
     if not len(stamps.get("estimate/time_us", ())):
         return observation.Kinematics(*pose_at(path, time_us))

@@ -28,8 +28,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import Samples, Stage, Summary
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report import theme
-from airl_mav.report.document import OUTCOME_LABELS, ms
+from airl_mav.report import document, theme
 
 LONG_TAIL = 30.0
 """Ratio of maximum to median above which the axis is logarithmic."""
@@ -81,7 +80,7 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Fi
         ("p99", 99.0, summary.p99),
     ):
         if at_us is not None:
-            marks.append(f"{name} {ms(at_us)}")
+            marks.append(f"{name} {document.ms(at_us)}")
             bottom.plot(
                 at_us / US_PER_MS, level, "o", ms=4, color=theme.MARK, clip_on=False, zorder=3
             )
@@ -140,7 +139,7 @@ def map_figure(
     theme.plain_axes(ax, grid=False)
     theme.label_axes(ax, "east [m]", "north [m]")
     theme.legend_below(figure, 3, handletextpad=0.4, columnspacing=1.2)
-    label = OUTCOME_LABELS[episode.outcome]
+    label = document.OUTCOME_LABELS[episode.outcome]
     alt = f"Flight {episode.index} from above, coloured by speed: {label}, {episode.reason}"
     return theme.render(figure, f"flight-{episode.index:03d}-map", alt)
 
@@ -185,7 +184,7 @@ def _draw_path(
         mew=1.0,
         ls="none",
         zorder=4,
-        label=f"end: {OUTCOME_LABELS[outcome]}",
+        label=f"end: {document.OUTCOME_LABELS[outcome]}",
     )
     bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, shrink=0.45, aspect=26, pad=0.015)
     speed_bar(bar)
@@ -394,7 +393,7 @@ def _legend(episodes: Sequence[EpisodeRecord]) -> list[Line2D]:
         count = sum(episode.outcome is outcome for episode in episodes)
         if count:
             marker = "" if outcome is Outcome.SUCCESS else OUTCOME_MARKERS[outcome]
-            label = f"{OUTCOME_LABELS[outcome]} ({count})"
+            label = f"{document.OUTCOME_LABELS[outcome]} ({count})"
             handles.append(
                 Line2D([], [], color=OUTCOME_COLOURS[outcome], marker=marker, ms=5, label=label)
             )

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import rgb_of
-from airl_mav.core import addons
-from airl_mav.core.constants import US_PER_MS
-from airl_mav.core.files import Arrays, replace_file
+from airl_mav.core import addons, constants, files
 from airl_mav.flight.episode_record import EpisodeRecord, ranked
 from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
@@ -87,7 +85,7 @@ def chosen(count: int, most: int = MAX_IMAGES, last: int = LAST) -> list[int]:
 
 def flight_data(
     flight: tracking.TrackedFlight,
-    stamps: Arrays,
+    stamps: files.Arrays,
     seen: Sequence[SeenDecision],
     range_m: float,
     again: PolicyAgain | None,
@@ -127,7 +125,7 @@ def _unit(name: str) -> float:
     return UNITS[max(ends, key=len)]
 
 
-def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
+def _stages(stamps: files.Arrays) -> dict[str, list[float | None]]:
     """Return the durations of the sent decisions by stage [ms]; None = unknown."""
     series = decision_series(stamps)
     sent = np.asarray(stamps.get("sent_us", np.zeros(0, np.int64)))
@@ -138,7 +136,8 @@ def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
         if values is None or len(values) != len(sent) or (values[there] == NO_STAMP).all():
             continue
         found[stage.key] = [
-            None if us == NO_STAMP else round(float(us) / US_PER_MS, 2) for us in values[there]
+            None if us == NO_STAMP else round(float(us) / constants.US_PER_MS, 2)
+            for us in values[there]
         ]
     return found
 
@@ -435,7 +434,7 @@ def build_page(
     drawn = [picture for _, contents in sections for _, found in contents for picture in found]
     overview = overview_picture(run, arenas) if run.episodes else None
     if overview is not None:
-        replace_file(folder / f"{overview.name}.png", overview.png)
+        files.replace_file(folder / f"{overview.name}.png", overview.png)
     template = document.environment().get_template("report.html.j2")
     html = template.render(
         page=page,
@@ -447,7 +446,7 @@ def build_page(
         library=packed(plotly_scene.plotly_script()) if page.view else "",
     )
     path = folder / document.REPORT_FILE
-    replace_file(path, html.encode())
+    files.replace_file(path, html.encode())
     return path
 
 

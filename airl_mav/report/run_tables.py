@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core import constants, resource_use
 from airl_mav.core.progress import DRAWING, Progress
-from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import NO_ESTIMATE
 from airl_mav.latency.stages import CommandAges, Summary, command_ages, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
-from airl_mav.report import document
+from airl_mav.report import document, run_verdict, tracking
 from airl_mav.report.document import print_place, print_verdict
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
@@ -37,8 +36,6 @@ from airl_mav.report.measures import (
     rate_digits,
     summarize_run,
 )
-from airl_mav.report.run_verdict import OverallVerdict, save_verdict
-from airl_mav.report.tracking import TrackedFlight
 
 BYTES_PER_MIB = 1 << 20
 
@@ -208,7 +205,7 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> document.TableView |
     return document.TableView("real-time", "Real time", columns, tuple(rows))
 
 
-def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
+def _use_rows(uses: Sequence[resource_use.ProcessUse]) -> list[tuple[str, ...]]:
     if not uses:
         return []
     n, wall_s = f"{len(uses)}", sum(use.wall_s for use in uses)
@@ -250,7 +247,7 @@ def _real_time_factor(run: LoadedRun) -> str:
     if not wall_s or run.info.setup.speed is None:
         return "not paced"
     flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
-    return f"{flown_us / US_PER_S / wall_s:.3f} (asked {run.info.setup.speed:g})"
+    return f"{flown_us / constants.US_PER_S / wall_s:.3f} (asked {run.info.setup.speed:g})"
 
 
 ROWS = (
@@ -262,7 +259,7 @@ ROWS = (
 )
 
 
-def estimation_table(flights: Sequence[TrackedFlight]) -> document.TableView | None:
+def estimation_table(flights: Sequence[tracking.TrackedFlight]) -> document.TableView | None:
     """Return the errors of the estimator in navigation; None without recorded estimates."""
     known = [(f.time_s >= 0.0, f.errors) for f in flights if f.errors is not None]
     known = [(flies, errors) for flies, errors in known if flies.any()]
@@ -376,7 +373,7 @@ def print_report(run: LoadedRun, console: Console) -> None:
 
 def show_report(
     run: LoadedRun,
-    verdict: OverallVerdict,
+    verdict: run_verdict.OverallVerdict,
     console: Console,
     progress: Progress | None = None,
     *,
@@ -386,7 +383,7 @@ def show_report(
     """Print `tables` of a run, `draw` and print its page, then print the verdict; save both."""
     progress = progress or Progress()
     if run.episodes:
-        save_verdict(verdict, run.path)
+        run_verdict.save_verdict(verdict, run.path)
     if tables:
         print_report(run, console)
     page: Path | None = None

@@ -16,8 +16,7 @@ from typing import Literal
 
 from pydantic import TypeAdapter
 
-from airl_mav.core.errors import EXIT_INVALID, EXIT_NOT_MET, EXIT_UNDECIDED
-from airl_mav.core.files import read_typed, replace_file, write_json
+from airl_mav.core import errors, files
 from airl_mav.flight.episode_record import EpisodeRecord, Setup
 from airl_mav.flight.judge import BY_HAND, STRANGER, Outcome
 from airl_mav.flight.requirements import Finding, Requirement, RequirementDecision, find
@@ -35,9 +34,9 @@ VERDICT_FILE = "verdict.json"
 Status = Literal["invalid", "not met", "undecided", "met", "nothing required"]
 
 EXIT_CODES: dict[Status, int] = {
-    "invalid": EXIT_INVALID,
-    "not met": EXIT_NOT_MET,
-    "undecided": EXIT_UNDECIDED,
+    "invalid": errors.EXIT_INVALID,
+    "not met": errors.EXIT_NOT_MET,
+    "undecided": errors.EXIT_UNDECIDED,
     "met": 0,
     "nothing required": 0,
 }
@@ -200,12 +199,12 @@ def save_verdict(verdict: OverallVerdict, folder: Path) -> None:
     """Write `verdict.json`, including status and exit code, atomically."""
     data = _VERDICT.dump_python(verdict, mode="json")
     extra = {"status": verdict.status, "exit_code": verdict.exit_code}
-    write_json(folder / VERDICT_FILE, {**data, **extra})
+    files.write_json(folder / VERDICT_FILE, {**data, **extra})
 
 
 def load_verdict(folder: Path) -> OverallVerdict:
     """Read the verdict of a folder. Raises UsageError."""
-    return read_typed(folder / VERDICT_FILE, _VERDICT, SCHEMA, "verdict")
+    return files.read_typed(folder / VERDICT_FILE, _VERDICT, SCHEMA, "verdict")
 
 
 def requirements_of(folder: Path) -> tuple[Requirement, ...]:
@@ -240,7 +239,7 @@ def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
             failure.text = "\n".join(verdict.sentences)
     ET.SubElement(part, "system-out").text = "\n".join(verdict.lines)
     ET.indent(root)
-    replace_file(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
+    files.replace_file(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
 GLYPH_PX = 6.6
@@ -264,7 +263,7 @@ def write_badge(verdict: OverallVerdict, path: Path) -> None:
             colour=BADGE_COLOURS[verdict.status],
         )
     )
-    replace_file(path, svg.encode())
+    files.replace_file(path, svg.encode())
 
 
 def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:

@@ -13,15 +13,11 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import Bbox, TransformedBbox
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.files import Arrays
-from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
-from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory, estimate_of
+from airl_mav.core import constants, files, frames
+from airl_mav.flight import episode_record, trajectory
 from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, commanded, setpoint_column
 from airl_mav.rehearsal.run_folder import MOTOR_OUTPUTS, MOTOR_TIMES, LoadedRun, flown_path
-from airl_mav.report import theme
-from airl_mav.report.policy_view import SeenDecision
+from airl_mav.report import policy_view, theme
 from airl_mav.report.theme import pictured
 
 Floats = NDArray[np.float64]
@@ -87,7 +83,7 @@ class EstimateErrors:
 class TrackedFlight:
     """Flight up to its verdict."""
 
-    record: EpisodeRecord
+    record: episode_record.EpisodeRecord
     time_s: Floats
     """Time (m,) since the start of navigation; negative before."""
     flown: TrackedMotion
@@ -103,7 +99,7 @@ class TrackedFlight:
     """Motor outputs (m, 4), 0 to 1, in PX4's order; None if not recorded."""
 
 
-def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
+def track(run: LoadedRun, record: episode_record.EpisodeRecord) -> TrackedFlight | None:
     """Return commanded, flown and estimated motion of a flight; None without a path."""
     path = flown_path(run, record)
     if path is None or len(path) < 2:
@@ -116,7 +112,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
     elif "body_roll_rate_deg_s" in commands.values:
         flown = replace(flown, **_turned(path))
     estimated = errors = None
-    if (recorded := estimate_of(stamps)) is not None and len(recorded) > 1:
+    if (recorded := trajectory.estimate_of(stamps)) is not None and len(recorded) > 1:
         believed = recorded.at(path.time_us)
         estimated, estimated_heading = _motion(
             path.time_us, believed.position, believed.velocity, believed.quaternion
@@ -124,7 +120,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         errors = _errors(path, flown, heading, believed, estimated, estimated_heading)
     return TrackedFlight(
         record=record,
-        time_s=(path.time_us - record.zero_us) / US_PER_S,
+        time_s=(path.time_us - record.zero_us) / constants.US_PER_S,
         flown=flown,
         estimated=estimated,
         errors=errors,
@@ -136,7 +132,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
     )
 
 
-def _motors(stamps: Arrays, time_us: NDArray[np.int64]) -> Floats | None:
+def _motors(stamps: files.Arrays, time_us: NDArray[np.int64]) -> Floats | None:
     times, outputs = stamps.get(MOTOR_TIMES), stamps.get(MOTOR_OUTPUTS)
     if times is None or outputs is None or len(times) < 2:
         return None
@@ -144,7 +140,7 @@ def _motors(stamps: Arrays, time_us: NDArray[np.int64]) -> Floats | None:
     return np.stack(columns, axis=1)
 
 
-def commands_of(stamps: Arrays, zero_us: int) -> Commands:
+def commands_of(stamps: files.Arrays, zero_us: int) -> Commands:
     """Return the sent setpoints with times relative to `zero_us`."""
     sent = np.asarray(stamps.get("sent_us", np.zeros(0)), np.int64)
     column = setpoint_column(stamps) or SETPOINT
@@ -156,16 +152,16 @@ def commands_of(stamps: Arrays, zero_us: int) -> Commands:
         for name, row in zip(COMMANDED[column], numbers, strict=True)
         if name
     }
-    return Commands((sent[there] - zero_us) / US_PER_S, values)
+    return Commands((sent[there] - zero_us) / constants.US_PER_S, values)
 
 
 def _motion(
     time_us: NDArray[np.int64], position: Floats, velocity: Floats, quaternion: Floats
 ) -> tuple[TrackedMotion, Floats]:
-    roll, pitch, yaw = quats_to_euler(quaternion)
+    roll, pitch, yaw = frames.quats_to_euler(quaternion)
     heading: Floats = np.unwrap(yaw)
-    level = ned_to_heading(velocity, heading)
-    rate = np.gradient(heading, time_us / US_PER_S)
+    level = frames.ned_to_heading(velocity, heading)
+    rate = np.gradient(heading, time_us / constants.US_PER_S)
     motion = TrackedMotion(
         forward_m_s=level[:, 0],
         right_m_s=level[:, 1],
@@ -177,14 +173,14 @@ def _motion(
     return motion, heading
 
 
-def _turned(path: Trajectory) -> dict[str, Floats]:
+def _turned(path: trajectory.Trajectory) -> dict[str, Floats]:
     """Return the body rates (m,) [deg/s] by their names in `TrackedMotion`."""
     q = path.quaternion
-    turn = quat_multiply((q[:-1] * (1.0, -1.0, -1.0, -1.0)).T, q[1:].T).T
+    turn = frames.quat_multiply((q[:-1] * (1.0, -1.0, -1.0, -1.0)).T, q[1:].T).T
     sine = np.linalg.norm(turn[:, 1:], axis=1)
     # q and -q are the same attitude; take the shorter rotation.
     angle = 2.0 * np.arctan2(sine, np.abs(turn[:, 0])) * np.where(turn[:, 0] < 0.0, -1.0, 1.0)
-    passed_s = np.diff(path.time_us) / US_PER_S
+    passed_s = np.diff(path.time_us) / constants.US_PER_S
     steps = turn[:, 1:] * (angle / np.maximum(sine, 1e-12) / passed_s)[:, None]
     # The steps are rates between samples; each sample gets the mean of both sides.
     sides = np.concatenate([steps[:1], steps, steps[-1:]])
@@ -193,10 +189,10 @@ def _turned(path: Trajectory) -> dict[str, Floats]:
 
 
 def _errors(
-    path: Trajectory,
+    path: trajectory.Trajectory,
     flown: TrackedMotion,
     heading: Floats,
-    believed: Trajectory,
+    believed: trajectory.Trajectory,
     estimated: TrackedMotion,
     estimated_heading: Floats,
 ) -> EstimateErrors:
@@ -256,7 +252,7 @@ class _Line:
 
 
 def tracking_figure(
-    flight: TrackedFlight, seen: Sequence[SeenDecision] = (), range_m: float = 0.0
+    flight: TrackedFlight, seen: Sequence[policy_view.SeenDecision] = (), range_m: float = 0.0
 ) -> theme.FigureImage:
     """Draw a flight over navigation time, with up to `IMAGES` images of decisions above."""
     rows = _rows(flight)

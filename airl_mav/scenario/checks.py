@@ -18,10 +18,8 @@ from airl_mav.core.frames import Goal
 from airl_mav.core.scheduling import check_permitted
 from airl_mav.faults import GYM, LINKS, Fault, check_gym
 from airl_mav.latency.injection import Injection, select_injection
-from airl_mav.policy.actions import KINDS, Policy
-from airl_mav.policy.registry import PolicyInfo, load_policy
-from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.projections import SLOW, Renderer
+from airl_mav.policy import actions, registry
+from airl_mav.profiles import computer, projections
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NOT_IN_GYM, Aircraft, Ports
@@ -78,9 +76,9 @@ def check_start(scenario: model.Scenario) -> None:
             )
 
 
-def check_drawing(renderer: Renderer, level: model.LevelName) -> None:
+def check_drawing(renderer: projections.Renderer, level: model.LevelName) -> None:
     """Raise FieldError for a renderer that the level does not support."""
-    if renderer in SLOW and level == GYM:
+    if renderer in projections.SLOW and level == GYM:
         raise FieldError("renderer", renderer, "raycast, but at level lockstep or sitl")
 
 
@@ -177,7 +175,7 @@ TRANSPORT_US = round(5.0 * US_PER_MS)
 
 
 def decide_piloting(
-    asked: model.Decisions, policy: PolicyInfo, goal_radius_m: float
+    asked: model.Decisions, policy: registry.PolicyInfo, goal_radius_m: float
 ) -> tuple[model.PilotSettings, model.WatchdogSettings]:
     """Return the flight settings of a policy: as configured, else from its card, else defaults.
 
@@ -186,7 +184,7 @@ def decide_piloting(
     """
     card = policy.card
     known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
-    if not KINDS[policy.commands].steady:
+    if not actions.KINDS[policy.commands].steady:
         # Decide on every image: nothing else keeps the vehicle level.
         known["decisions"] = "pipelined"
     hover_s = asked.watchdog.hover_after_s
@@ -221,10 +219,10 @@ def decide_piloting(
 
 
 def check_commands(
-    policy: PolicyInfo, asked: str, *, level: str, firmware: str = "builtin"
+    policy: registry.PolicyInfo, asked: str, *, level: str, firmware: str = "builtin"
 ) -> None:
     """Raise FieldError for commands that the level or the firmware does not support."""
-    kind = KINDS[policy.commands]
+    kind = actions.KINDS[policy.commands]
     if level not in kind.levels:
         accepted = (
             "at level lockstep or sitl: the vectorized simulator flies velocities and body rates"
@@ -237,14 +235,14 @@ def check_commands(
 
 
 def check_compensated(
-    pilot: model.PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile
+    pilot: model.PilotSettings, policy: registry.PolicyInfo, vehicle: VehicleProfile
 ) -> None:
     """Raise FieldError for unsupported latency compensation.
 
     Compensation does not support policies without velocity commands, whose effect is not predicted,
     nor policies with additional cameras, whose images are not predicted.
     """
-    kind = KINDS[policy.commands]
+    kind = actions.KINDS[policy.commands]
     if pilot.compensate and not kind.steady:
         raise FieldError(
             "compensate",
@@ -266,7 +264,7 @@ def check_compensated(
         )
 
 
-def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object) -> None:
+def check_goal_height(policy: registry.PolicyInfo, goal: Goal, field: str, asked: object) -> None:
     """Raise FieldError, of `field`, if the policy requires a goal height and the goal has none."""
     if policy.card is not None and policy.card.observation.goal_height and len(goal) == 2:
         raise FieldError(
@@ -291,7 +289,7 @@ def check_quota(asked: model.Decisions, injection: Injection, level: model.Level
 
 
 def select_latency(
-    asked: model.Lateness, policy: PolicyInfo, *, on_this_computer: bool
+    asked: model.Lateness, policy: registry.PolicyInfo, *, on_this_computer: bool
 ) -> Injection:
     """Return the latency of a stand-alone companion.
 
@@ -300,7 +298,7 @@ def select_latency(
     """
     return select_injection(
         asked.latency,
-        load_computer(asked.computer),
+        computer.load_computer(asked.computer),
         asked.workload,
         policy_sha256=None if on_this_computer else policy.sha256,
         macs=policy.macs,
@@ -308,10 +306,10 @@ def select_latency(
 
 
 def load_asked_policy(
-    asked: model.Decisions, policy: PolicyInfo, hold_s: float, seed: int
-) -> Policy:
+    asked: model.Decisions, policy: registry.PolicyInfo, hold_s: float, seed: int
+) -> actions.Policy:
     """Return the configured policy, ready to decide. Raises UsageError."""
-    return load_policy(
+    return registry.load_policy(
         policy,
         hold_s,
         runtime=asked.runtime,
@@ -334,6 +332,6 @@ def between_commands(pilot: model.PilotSettings, hover_s: float | None) -> str:
         words.append(f"{pilot.decisions} decisions")
     if pilot.compensate:
         words.append("latency compensated")
-    if not KINDS[pilot.commands].steady:
-        words.append(f"{KINDS[pilot.commands].title} and thrust")
+    if not actions.KINDS[pilot.commands].steady:
+        words.append(f"{actions.KINDS[pilot.commands].title} and thrust")
     return ", ".join(words)

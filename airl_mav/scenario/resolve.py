@@ -16,8 +16,7 @@ from airl_mav.core.constants import Level
 from airl_mav.core.errors import FieldError
 from airl_mav.core.first_start import CompileJob, CompilePlan, compile_shown
 from airl_mav.core.frames import Goal
-from airl_mav.flight.episode_record import BUILT_IN, EpisodeRecord, Part, Setup
-from airl_mav.flight.judge import GOAL_RADIUS_M, Task
+from airl_mav.flight import episode_record, judge
 from airl_mav.latency.injection import (
     FixedSampler,
     Injection,
@@ -26,15 +25,12 @@ from airl_mav.latency.injection import (
     select_injection,
     without_timing,
 )
-from airl_mav.policy.actions import Policy
-from airl_mav.policy.registry import LearnedPolicy, PolicyInfo, camera_refused, find_policy
+from airl_mav.policy import actions, registry
 from airl_mav.prediction import Compensator
+from airl_mav.profiles import camera, loading, projections
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import check_noise, check_renderer
 from airl_mav.profiles.computer import ComputerProfile
-from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.profiles.parameters import flown_values
-from airl_mav.profiles.projections import CameraKind
 from airl_mav.profiles.vehicle import VehicleProfile, check_spread, equipped
 from airl_mav.scenario import checks
 from airl_mav.scenario.aircraft import FirmwareName, PlantName
@@ -67,7 +63,7 @@ def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
     )
 
 
-def vectorized_plan(kind: CameraKind) -> CompilePlan:
+def vectorized_plan(kind: projections.CameraKind) -> CompilePlan:
     """Return the kernels of level gym and of a training, by the main camera's kind."""
     return CompilePlan(
         "vectorized",
@@ -80,7 +76,7 @@ def vectorized_plan(kind: CameraKind) -> CompilePlan:
     )
 
 
-def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedScenario:
+def resolve(scenario: Scenario, policy: registry.PolicyInfo | None = None) -> ResolvedScenario:
     """Validate a scenario before anything starts, and load all referenced profiles.
 
     `policy` replaces the scenario's. Raises UsageError if fields contradict each other, a profile
@@ -95,24 +91,24 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: 0, any free port, is invalid here.
         checks.check_ports(scenario.open_ports, any_camera=False)
-    policy = policy or find_policy(scenario.policy, trust=scenario.trust)
+    policy = policy or registry.find_policy(scenario.policy, trust=scenario.trust)
     checks.check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
-    pilot, watchdog = checks.decide_piloting(scenario, policy, GOAL_RADIUS_M)
+    pilot, watchdog = checks.decide_piloting(scenario, policy, judge.GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)
     further = vehicle.cameras.values()
-    check_noise(vehicle.camera, scenario.sensors, scenario.faults, further=further)
+    camera.check_noise(vehicle.camera, scenario.sensors, scenario.faults, further=further)
     checks.check_fitted(vehicle.sensors, scenario.faults)
-    if reason := camera_refused(policy, vehicle):
+    if reason := registry.camera_refused(policy, vehicle):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
         )
     checks.check_compensated(pilot, policy, vehicle)
-    arena = load_profile("arenas", scenario.arena, ArenaSpec)
+    arena = loading.load_profile("arenas", scenario.arena, ArenaSpec)
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
-    check_renderer(vehicle.camera, scenario.renderer, arena, further)
+    camera.check_renderer(vehicle.camera, scenario.renderer, arena, further)
     checks.check_quota(scenario, injection, scenario.level)
     resolved = ResolvedScenario(
         scenario=scenario,
@@ -159,7 +155,7 @@ ARRIVAL_SHARE = 0.8
 referee the true one."""
 
 FIRMWARE_TITLES: dict[FirmwareName, str] = {
-    "builtin": BUILT_IN,
+    "builtin": episode_record.BUILT_IN,
     "px4": "PX4 SITL",
     "ardupilot": "ArduPilot SITL",
     "px4-hitl": "PX4 on a board",
@@ -183,7 +179,7 @@ class ResolvedScenario:
     """Vehicle with its computer and payload."""
     arena: ArenaSpec
     computer: ComputerProfile
-    policy: PolicyInfo
+    policy: registry.PolicyInfo
     injection: Injection
     """Source of t2."""
     pilot: PilotSettings
@@ -196,7 +192,7 @@ class ResolvedScenario:
         """Seed of each episode, by index."""
         return self.scenario.seeds
 
-    def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
+    def left(self, done: Iterable[episode_record.EpisodeRecord] = ()) -> list[PlannedEpisode]:
         """Return the episodes that are not in `done`."""
         there = {record.index for record in done}
         return [PlannedEpisode(i, seed) for i, seed in enumerate(self.seeds) if i not in there]
@@ -229,7 +225,7 @@ class ResolvedScenario:
             "vehicle_body": self.vehicle.body.model_dump(),
             "policy_sha256": self.policy.sha256,
             "profiles_sha256": {
-                kind: profile_digest(profile) for kind, profile in profiles.items()
+                kind: loading.profile_digest(profile) for kind, profile in profiles.items()
             },
         }
 
@@ -291,9 +287,9 @@ class ResolvedScenario:
         )
         return set_out_later(arena, self.takeoff_s)
 
-    def task(self, goal: Goal) -> Task:
+    def task(self, goal: Goal) -> judge.Task:
         """Return the referee's task for a flight to a goal."""
-        return Task(goal, self.pilot.goal_radius_m, self.scenario.time_limit_s)
+        return judge.Task(goal, self.pilot.goal_radius_m, self.scenario.time_limit_s)
 
     @property
     def rules(self) -> str:
@@ -305,17 +301,17 @@ class ResolvedScenario:
         )
 
     @property
-    def setup(self) -> Setup:
+    def setup(self) -> episode_record.Setup:
         """Setup for the head of every report."""
         scenario, hover_s = self.scenario, self.watchdog.hover_after_s
         without = f" (its input {scenario.ablate!r} made zero)" if scenario.ablate else ""
-        return Setup(
+        return episode_record.Setup(
             level=self.level,
             firmware=FIRMWARE_TITLES[scenario.firmware],
-            vehicle=Part(scenario.vehicle, self.vehicle.description),
-            arena=Part(scenario.arena, self.arena.description),
-            policy=Part(self.policy.name, f"{self.policy.description}{without}"),
-            computer=Part(scenario.computer, self.computer.description),
+            vehicle=episode_record.Part(scenario.vehicle, self.vehicle.description),
+            arena=episode_record.Part(scenario.arena, self.arena.description),
+            policy=episode_record.Part(self.policy.name, f"{self.policy.description}{without}"),
+            computer=episode_record.Part(scenario.computer, self.computer.description),
             computer_watts=self.computer.onboard_watts,
             computer_on_ground=self.computer.ground_equipment,
             injection=self.injection,
@@ -366,19 +362,19 @@ class ResolvedScenario:
             return None
         return Compensator(1, self.vehicle, Intrinsics.of(self.vehicle.camera))
 
-    def fresh_policy(self, seed: int) -> Policy:
+    def fresh_policy(self, seed: int) -> actions.Policy:
         """Return the policy at the start of a seed's flight. Raises UsageError."""
         loaded = self._loaded_policy
-        if isinstance(loaded, LearnedPolicy):
+        if isinstance(loaded, registry.LearnedPolicy):
             return loaded.with_generator(checks.action_generator(seed))
         return self._load_policy()
 
     @cached_property
-    def _loaded_policy(self) -> Policy:
+    def _loaded_policy(self) -> actions.Policy:
         """Policy, with its network loaded once."""
         return self._load_policy()
 
-    def _load_policy(self) -> Policy:
+    def _load_policy(self) -> actions.Policy:
         scenario = self.scenario
         return checks.load_asked_policy(scenario, self.policy, self.pilot.hold_s, scenario.seed)
 

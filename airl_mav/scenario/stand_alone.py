@@ -14,8 +14,7 @@ from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switc
 from airl_mav.core.frames import Goal
 from airl_mav.faults import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
-from airl_mav.scenario import checks, model
-from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.scenario import aircraft, checks, model
 
 SPEEDS = 0.0, 100.0
 """Limits of the speed; time beyond the host's capacity is skipped and reported."""
@@ -37,7 +36,7 @@ FARTHEST_M = 10_000.0
 """Maximum goal distance on each axis."""
 
 
-class StandAloneVehicle(Aircraft):
+class StandAloneVehicle(aircraft.Aircraft):
     """Flight controller, vehicle and camera without a companion, for any client."""
 
     GROUP: ClassVar[str] = "execution"

@@ -20,20 +20,18 @@ from torch import nn
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
+from airl_mav.policy import card, layouts, observation_spec
 from airl_mav.policy.actions import (
     BODY_RATES,
     ActionSpec,
     continuous_numbers,
     discrete_actions,
 )
-from airl_mav.policy.card import PolicyCard, PolicyFacts, first_line
-from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
-from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.profiles.projections import CHANNELS, KINDS
 from airl_mav.training import export_request, onnx_export
 from airl_mav.training.onnx_export import RecurrentNetwork
 
-USUAL = ("depth", VELOCITY, GOAL)
+USUAL = ("depth", layouts.VELOCITY, layouts.GOAL)
 """Inputs of most networks."""
 
 CHECKED = 64
@@ -151,13 +149,13 @@ def _further_keys(seen: spaces.Space[Any]) -> tuple[str, ...]:
 
 def check_spaces(
     model: BaseAlgorithm,
-    spec: ObservationSpec,
+    spec: observation_spec.ObservationSpec,
     actions: ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
     """Raise UsageError unless a model's spaces match a layout and an action set."""
     seen = model.observation_space
-    wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
+    wanted = {key: (box.shape, box.dtype) for key, box in layouts.boxes(spec).items()}
     accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
     parts = dict(seen.spaces) if isinstance(seen, spaces.Dict) else {"not a Dict": seen}
     images = {spec.kind, *spec.further_keys.values()}.difference(normalised)
@@ -175,8 +173,8 @@ def check_spaces(
             told += f". What camera {', '.join(others)} is of is told by --like CONFIGURATION"
         if any(part.dtype != np.uint8 for key, part in parts.items() if key in images):
             told += ". What a VecNormalize made of them is told by --vec-normalize FILE"
-        if not spec.in_flight and IN_FLIGHT in parts:
-            told += f". What {IN_FLIGHT} tells is told by --like CONFIGURATION"
+        if not spec.in_flight and layouts.IN_FLIGHT in parts:
+            told += f". What {layouts.IN_FLIGHT} tells is told by --like CONFIGURATION"
         raise UsageError(told)
     space, count = model.action_space, discrete_actions(actions)
     if count is not None:
@@ -196,7 +194,7 @@ def check_spaces(
         )
 
 
-def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
+def export(asked: export_request.ExportRequest, command: str) -> card.PolicyCard:
     """Export the .zip of an SB3 model, or a torch module, as a policy; return its card.
 
     A .zip contains pickled Python objects and a module is code. Export only from trusted sources.
@@ -206,10 +204,10 @@ def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
     out = asked.out
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: not a folder")
-    write: Callable[[PolicyFacts], PolicyCard]
+    write: Callable[[card.PolicyFacts], card.PolicyCard]
     if asked.own_module:
         facts = asked.facts(command)
-        module = load_module(asked.model, asked.weights, tuple(boxes(facts.observation)))
+        module = load_module(asked.model, asked.weights, tuple(layouts.boxes(facts.observation)))
         write = partial(onnx_export.export_network, module, folder=out, with_torch=asked.with_torch)
     else:
         learner = load_sb3(Path(asked.model), asked.algorithm or "")
@@ -236,7 +234,7 @@ def taken_by(model: BaseAlgorithm) -> export_request.ModelProperties:
     actions: str | None = None
     if isinstance(space, spaces.Box):
         actions = {3: "velocity3d", 4: BODY_RATES}.get(len(space.low), "velocity")
-    goal = images.get(GOAL)
+    goal = images.get(layouts.GOAL)
     tells_height = goal is not None and goal.shape == (4,)
     if kind is None or shape is None or len(shape) != 3:
         return export_request.ModelProperties(actions=actions)
@@ -256,7 +254,7 @@ def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) ->
     try:
         module = found if isinstance(found, nn.Module) else found()
     except Exception as error:
-        problem = f"cannot be made without arguments: {first_line(error)}"
+        problem = f"cannot be made without arguments: {card.first_line(error)}"
         raise FieldError(MODELS.field, name, problem=problem) from error
     if not isinstance(module, nn.Module):
         raise FieldError(MODELS.field, name, MODELS.wanted)
@@ -290,19 +288,19 @@ def _load_weights(module: nn.Module, path: Path) -> None:
 
 def export_sb3(
     model: BaseAlgorithm,
-    facts: PolicyFacts,
+    facts: card.PolicyFacts,
     folder: Path,
     *,
     with_torch: bool = False,
     learned: VecNormalize | None = None,
-) -> PolicyCard:
+) -> card.PolicyCard:
     """Write a model of SB3 or sb3-contrib as `policy.onnx` with its card, and return the card.
 
     `learned` is the VecNormalize around its environment, exported with the network. Raises
     UsageError if the model's spaces do not fit the facts, or it cannot be exported.
     """
     check_spaces(model, facts.observation, facts.actions, export_request.normalised_keys(learned))
-    network = network_of(model, tuple(boxes(facts.observation)), learned)
+    network = network_of(model, tuple(layouts.boxes(facts.observation)), learned)
     training = model.policy.training
     model.policy.set_training_mode(False)
     try:
@@ -329,7 +327,7 @@ def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
         )
     except Exception as error:  # Unpickling raises arbitrary exceptions.
         raise UsageError(
-            f"{path}: not a model of {learner.__name__}: {first_line(error)}"
+            f"{path}: not a model of {learner.__name__}: {card.first_line(error)}"
         ) from None
     return model
 
@@ -351,7 +349,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 
 def _check_decisions(
-    model: BaseAlgorithm, network: nn.Module, facts: PolicyFacts, learned: VecNormalize | None
+    model: BaseAlgorithm, network: nn.Module, facts: card.PolicyFacts, learned: VecNormalize | None
 ) -> None:
     """Raise UsageError unless the network decides as the model's own `predict` does."""
     rng, device = np.random.default_rng(2), model.device
@@ -362,7 +360,7 @@ def _check_decisions(
     shown: Any = seen if learned is None else learned.normalize_obs(seen)
     decided, _ = model.policy.predict(shown, state, deterministic=True)
     with torch.no_grad():
-        arrays = [*(seen[key] for key in boxes(facts.observation)), *memory.values()]
+        arrays = [*(seen[key] for key in layouts.boxes(facts.observation)), *memory.values()]
         found = network(*(torch.from_numpy(array).to(device) for array in arrays))
         outputs = (found[0] if memory else found).cpu().numpy()
     slack = onnx_export.TOLERANCE * max(1.0, float(np.abs(outputs).max()))

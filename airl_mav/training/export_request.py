@@ -30,8 +30,7 @@ from airl_mav.policy.actions import (
 )
 from airl_mav.policy.card import PolicyFacts, Training, first_line
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
-from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.projections import UNDISTORTED, CameraKind, Projection
+from airl_mav.profiles import loading, projections
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
 
@@ -105,7 +104,7 @@ DEFAULTS: dict[str, Any] = {
     "kind": "depth",
     "projection": "pinhole",
     "horizontal_fov_deg": 90.0,
-    "distortion": UNDISTORTED,
+    "distortion": projections.UNDISTORTED,
     "range_m": 20.0,
     "in_flight": (),
     "goal_height": False,
@@ -130,7 +129,7 @@ class ModelProperties(NamedTuple):
     image: str | None = None
     frames: int | None = None
     actions: ActionSetName | None = None
-    kind: CameraKind | None = None
+    kind: projections.CameraKind | None = None
     goal_height: bool | None = None
 
 
@@ -173,10 +172,10 @@ class ExportRequest(BaseModel):
         "images that the network sees, of this decision and those before it; by default"
         " as the .zip says, or 1"
     )
-    kind: CameraKind | None = optional(
+    kind: projections.CameraKind | None = optional(
         "what the camera gives: depth, rgb or grey; by default as the .zip says, or depth"
     )
-    projection: Projection | None = optional(
+    projection: projections.Projection | None = optional(
         "the camera's: pinhole, cylindrical or fisheye; by default pinhole"
     )
     horizontal_fov_deg: float | None = optional(
@@ -281,7 +280,7 @@ def _environment(name: str) -> EnvironmentSpec:
     # Imported here: few exports need them.
     from airl_mav.training.config import TrainingConfig
 
-    environment = load_profile("training", name, TrainingConfig).environment
+    environment = loading.load_profile("training", name, TrainingConfig).environment
     if environment.safe_velocity is None:
         return environment
     from airl_mav.envs.stopping import bounded

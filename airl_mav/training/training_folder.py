@@ -8,10 +8,8 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, Field, TypeAdapter
 
-from airl_mav.core import files
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core import errors, files, machine
 from airl_mav.core.fields import optional, switch
-from airl_mav.core.machine import provenance
 from airl_mav.core.progress import Event, Progress
 from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import TrainingConfig, check_fields, configured
@@ -72,11 +70,11 @@ class TrainingFolder:
         folder = cls(path)
         if not folder.begun:
             plain = config.model_dump(mode="json", exclude_none=True)
-            about = {"schema": SCHEMA, **provenance(command), "config": plain}
+            about = {"schema": SCHEMA, **machine.provenance(command), "config": plain}
             files.write_json(path / CONFIG_FILE, about)
             return folder
         if not resume:
-            raise UsageError(
+            raise errors.UsageError(
                 f"{path}: holds a training run already; accepted: another folder, or resume"
             )
         theirs = TrainingConfig.model_validate(folder.about()["config"])
@@ -85,7 +83,7 @@ class TrainingFolder:
             for name in TrainingConfig.model_fields
             if getattr(theirs, name) != getattr(config, name)
         ]:
-            raise UsageError(
+            raise errors.UsageError(
                 f"{path}: the run to resume has another configuration "
                 f"({', '.join(changed)}); accepted: the same"
             )
@@ -189,8 +187,8 @@ class TrainRequest(BaseModel):
         loaded = load_profile("training", self.config, TrainingConfig)
         try:
             check_fields(loaded.algorithm)
-        except FieldError as error:  # The error is in the file, not in an option.
-            raise UsageError(f"{self.config}: {error.line(sign=' = ')}") from None
+        except errors.FieldError as error:  # The error is in the file, not in an option.
+            raise errors.UsageError(f"{self.config}: {error.line(sign=' = ')}") from None
         # Without options that are not part of the configuration.
         asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume"}
         changes = self.model_dump(include=asked)

@@ -34,9 +34,7 @@ from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import SHIPPED
 from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.run_folder import locked
-from airl_mav.training import training_folder
-from airl_mav.training.algorithms import make_model
-from airl_mav.training.checkpoint import load_latest, save_checkpoint
+from airl_mav.training import algorithms, checkpoint, export, onnx_export, training_folder
 from airl_mav.training.config import (
     SELECTION_SEED,
     TrainingConfig,
@@ -44,8 +42,6 @@ from airl_mav.training.config import (
     check_fields,
     kind_of,
 )
-from airl_mav.training.export import export_sb3
-from airl_mav.training.onnx_export import GreedyDecisions
 
 
 def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
@@ -138,7 +134,7 @@ def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> N
         begin_with(model, Path(config.initial), None)
     if config.network.own or config.environment.layout not in SHIPPED:
         with TemporaryDirectory() as scratch:
-            export_sb3(model, facts_of(config, name, "", 0), Path(scratch))
+            export.export_sb3(model, facts_of(config, name, "", 0), Path(scratch))
 
 
 def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> NavigationVecEnv:
@@ -153,7 +149,7 @@ def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> Na
 
 def learner_of(config: TrainingConfig, env: NavigationVecEnv, device: str) -> BaseAlgorithm:
     """Create the learner of a training, with fresh weights. Raises UsageError."""
-    return make_model(config.algorithm, config.network, env, config.seed, device=device)
+    return algorithms.make_model(config.algorithm, config.network, env, config.seed, device=device)
 
 
 def fit(
@@ -174,7 +170,7 @@ def fit(
     model = learner_of(config, env, device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
     callback = _BetweenRollouts(config, folder, progress, env)
-    meta = load_latest(folder.checkpoints, model)
+    meta = checkpoint.load_latest(folder.checkpoints, model)
     if meta is not None:
         callback.restore(meta)
         folder.forget_after(model.num_timesteps)
@@ -241,7 +237,7 @@ class _BetweenRollouts(BaseCallback):
 
     def _save(self) -> None:
         self._saved = self.model.num_timesteps
-        save_checkpoint(self._folder.checkpoints, self.model, self._meta())
+        checkpoint.save_checkpoint(self._folder.checkpoints, self.model, self._meta())
 
     def _keep_zones(self) -> None:
         """Save the learner at the end of each curriculum zone, if requested."""
@@ -251,7 +247,7 @@ class _BetweenRollouts(BaseCallback):
         while self._zone < curriculum.zone:
             kept = self._folder.zone(self._zone)
             self._zone += 1
-            save_checkpoint(kept, self.model, self._meta())
+            checkpoint.save_checkpoint(kept, self.model, self._meta())
             replace_file(kept / training_folder.BEST_MODEL, model_bytes(self.model))
 
     # --- SB3's hooks
@@ -290,7 +286,7 @@ class _BetweenRollouts(BaseCallback):
         seconds, began_us = self._seconds(), self._clock.time_us()
         selection = self._config.selection
         seeds = range(SELECTION_SEED, SELECTION_SEED + selection.episodes)
-        decide, spec = GreedyDecisions(model), nominal(self._config.environment)
+        decide, spec = onnx_export.GreedyDecisions(model), nominal(self._config.environment)
         flown = list(fly_episodes(spec, decide, seeds, began=decide.began))
         curriculum = self._env.env.curriculum
         evaluation = summary(
@@ -362,7 +358,7 @@ def export_best(
     # The trained number of vehicles: with fewer, a rollout would not fill its batches.
     model = learner_of(config, environment_of(config), "cpu")
     model.set_parameters(str(folder.best_model), device="cpu")
-    return export_sb3(model, facts, folder.policy)
+    return export.export_sb3(model, facts, folder.policy)
 
 
 def facts_of(config: TrainingConfig, name: str, command: str, steps: int) -> PolicyFacts:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Gains, RateDemand
 from airl_mav.control.loops import Motors
 from airl_mav.control.memory import ticks_to_motors
-from airl_mav.core.constants import TICK_HZ
-from airl_mav.core.frames import Geodetic, Vector
+from airl_mav.core import constants, frames
 from firmware_sim import interfaces
 from firmware_sim.autopilot import autopilot_state, commander
 from firmware_sim.autopilot.climb import DECIDE_US, climb_record
@@ -45,7 +44,7 @@ class BuiltinAutopilot:
     Every call happens between two ticks, on one thread.
     """
 
-    rate_hz = TICK_HZ
+    rate_hz = constants.TICK_HZ
 
     def __init__(self, parameters: Parameters, new_filter: NewFilter = KernelFilter) -> None:
         """Boot. Arming requires convergence of the estimator, whose filter `new_filter` creates."""
@@ -70,7 +69,7 @@ class BuiltinAutopilot:
         self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value, record)
         self._controller = Controller(Gains.from_parameters(value), record)
-        self._memory: Vector = record["memory"][0]
+        self._memory: frames.Vector = record["memory"][0]
         parameters.on_change(self._parameters_changed)
         self._messages: list[autopilot_state.OperatorText] = []
         self._demand: AnyDemand | None = None
@@ -400,9 +399,9 @@ class BuiltinAutopilot:
     # --- towards MAVLink
 
     @property
-    def attitude(self) -> Vector:
+    def attitude(self) -> frames.Vector:
         """Estimated attitude quaternion (4,) body -> NED."""
-        attitude: Vector = self._state[Q:RATES].copy()
+        attitude: frames.Vector = self._state[Q:RATES].copy()
         return attitude
 
     @property
@@ -533,7 +532,7 @@ class BuiltinAutopilot:
 
     # --- towards the mission (navigation.plan.Crew)
 
-    def set_home(self, place: Geodetic | None) -> autopilot_state.Result:
+    def set_home(self, place: frames.Geodetic | None) -> autopilot_state.Result:
         """Move home; None = the current position."""
         done = self._home.set_here() if place is None else self._home.set_to(place)
         # Home is part of the snapshot, and modes may fly to it.
@@ -542,7 +541,7 @@ class BuiltinAutopilot:
             autopilot_state.Result.ACCEPTED if done else autopilot_state.Result.TEMPORARILY_REJECTED
         )
 
-    def set_origin(self, place: Geodetic) -> autopilot_state.Result:
+    def set_origin(self, place: frames.Geodetic) -> autopilot_state.Result:
         """Move the origin of local NED; rejected while armed.
 
         PX4 also moves it in flight and shifts all local positions.
@@ -559,7 +558,7 @@ class BuiltinAutopilot:
         self._snapshot, self._due_us = None, 0
         return autopilot_state.Result.ACCEPTED
 
-    def look_at(self, place: Geodetic | None) -> None:
+    def look_at(self, place: frames.Geodetic | None) -> None:
         """Turn the nose to a place during a mission; None = cancel."""
         self._navigator.missions.look_at(place)
 

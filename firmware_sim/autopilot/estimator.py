@@ -13,16 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from airl_mav.core import frames
-from airl_mav.core.addons import entries, load
-from airl_mav.core.constants import TICK_S
+from airl_mav.core import addons, constants, frames
 from airl_mav.vehicle.atmosphere import altitude_m
-from firmware_sim.autopilot import error_state
+from firmware_sim.autopilot import alignment, autopilot_state, error_state, yaw_estimator
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.alignment import Alignment, FieldCheck, add_record
-from firmware_sim.autopilot.autopilot_state import Clearance, StateEstimate
 from firmware_sim.autopilot.recovery import Recovery, RecoveryState
-from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.record import (
     GPS,
     MAG,
@@ -74,7 +69,7 @@ class Aiding:
     """True if GPS height must not be fused: two height sources would differ by a bias."""
     is_reference = False
     """True if the ground is the height reference: of GPS only the vertical speed is fused."""
-    ground: Clearance | None = None
+    ground: autopilot_state.Clearance | None = None
     """Height above ground; None = not measured."""
 
     def __init__(self, estimator: Estimator) -> None:
@@ -119,8 +114,8 @@ def _in_record(name: str, kind: type) -> Any:
 
 def aiding() -> type[Aiding]:
     """Return the installed fusion of further sensors."""
-    for place in entries("firmware_sim", "AIDING").values():
-        found: type[Aiding] = load(place)
+    for place in addons.entries("firmware_sim", "AIDING").values():
+        found: type[Aiding] = addons.load(place)
         return found
     return Aiding
 
@@ -157,14 +152,14 @@ class Estimator:
             )
         self.innovations: Callable[[str, frames.Vector, frames.Vector], None] | None = None
         """Callback with name, innovation and its covariance for every measurement."""
-        self._alignment = Alignment(value, record)
+        self._alignment = alignment.Alignment(value, record)
         self._chosen_origin: frames.Geodetic | None = None
         """Origin of local NED chosen before alignment; None = the vehicle's position."""
         self.time_us = 0
         """Time of the newest sample [µs]."""
         self._fixed_us: int | None = None
         """Time of alignment with a GPS position; None: not aligned, or aligned without GPS."""
-        self._estimate: StateEstimate | None = None
+        self._estimate: autopilot_state.StateEstimate | None = None
         # GPS is fused in two parts, so a bad height does not reject a good horizontal fix.
         horizontal = error_state.selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         record["gps_horizontal_h"] = horizontal
@@ -185,7 +180,7 @@ class Estimator:
         heading_h, heading_us = record["heading_h"][0], record["heading_fused_us"]
         self._heading = error_state.Measurement("heading", 2, heading_h, heading_us)
         self._horizon = error_state.FusionHorizon()
-        self.yaw = YawEstimator(record)
+        self.yaw = yaw_estimator.YawEstimator(record)
         """Heading estimate without a compass."""
         self.recovery = Recovery(self.state, self.filter, self.yaw, record)
         """Recovery from inertial sensor and heading faults."""
@@ -216,7 +211,7 @@ class Estimator:
         self._note(sample)
         if not self.aligned:
             measured = MAG * (sample.mag is not None) | PRESSURE * (sample.pressure_hpa is not None)
-            add_record(self.record, measured | GPS * (sample.gps is not None))
+            alignment.add_record(self.record, measured | GPS * (sample.gps is not None))
             self.align()
         else:
             self._predict(sample)
@@ -319,12 +314,12 @@ class Estimator:
         self._estimate = None
         return fused
 
-    def estimate(self) -> StateEstimate:
+    def estimate(self) -> autopilot_state.StateEstimate:
         """Return a copy of the estimate after the newest tick."""
         if self._estimate is None:
             row = self.state.copy()
             # Positional arguments and prebuilt slices: this runs in nearly every tick.
-            self._estimate = StateEstimate(
+            self._estimate = autopilot_state.StateEstimate(
                 self.time_us,
                 row[_POSITION],
                 row[_VELOCITY],
@@ -399,7 +394,7 @@ class Estimator:
         field = self.record["mag"][0] if self.aligned else self._alignment.field
         if field is None:
             return False
-        return FieldCheck.read(self.value).disturbed(field, es.attitude(self.state))
+        return alignment.FieldCheck.read(self.value).disturbed(field, es.attitude(self.state))
 
     def accuracy(self) -> tuple[float, float]:
         """Return the standard deviations of horizontal position [m] and velocity [m/s]."""
@@ -441,12 +436,12 @@ class Estimator:
         value = self.value
         q = np.zeros(es.N_STATES)
         # As in PX4, the variance grows by (noise dt)² per step.
-        q[es.VEL : es.ATT] = (value("EKF2_ACC_NOISE") * TICK_S) ** 2
-        q[es.ATT : es.GYRO] = (value("EKF2_GYR_NOISE") * TICK_S) ** 2
+        q[es.VEL : es.ATT] = (value("EKF2_ACC_NOISE") * constants.TICK_S) ** 2
+        q[es.ATT : es.GYRO] = (value("EKF2_GYR_NOISE") * constants.TICK_S) ** 2
         # Bias noises are per PX4 step: scale the variance from 100 Hz to this tick rate.
-        q[es.GYRO : es.ACC] = value("EKF2_GYR_B_NOISE") ** 2 * BIAS_STEP_S * TICK_S
-        q[es.ACC : es.BARO] = value("EKF2_ACC_B_NOISE") ** 2 * BIAS_STEP_S * TICK_S
-        q[es.BARO] = BARO_WALK_M_SQRT_S**2 * TICK_S
+        q[es.GYRO : es.ACC] = value("EKF2_GYR_B_NOISE") ** 2 * BIAS_STEP_S * constants.TICK_S
+        q[es.ACC : es.BARO] = value("EKF2_ACC_B_NOISE") ** 2 * BIAS_STEP_S * constants.TICK_S
+        q[es.BARO] = BARO_WALK_M_SQRT_S**2 * constants.TICK_S
         return q
 
     def _predict(self, sample: SensorSample) -> None:

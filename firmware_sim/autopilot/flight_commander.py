@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, frames
 from firmware_sim.autopilot import commander
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention, Supervisor
@@ -49,7 +48,7 @@ class AutoDisarm:
             # Termination has its own timeout, on the ground and in the air.
             if self._stopped_since_us is None:
                 self._stopped_since_us = time_us
-            due_us = self._stopped_since_us + self._value("COM_KILL_DISARM") * US_PER_S
+            due_us = self._stopped_since_us + self._value("COM_KILL_DISARM") * constants.US_PER_S
             if time_us >= due_us:
                 return commander.CommanderEvent.LOCKDOWN_TIMEOUT
             self.due_us = due_us
@@ -64,7 +63,7 @@ class AutoDisarm:
             self._standing_since_us = time_us
         # A landing and an unused arming have separate timeouts.
         limit_s = self._value("COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT")
-        due_us = self._standing_since_us + limit_s * US_PER_S
+        due_us = self._standing_since_us + limit_s * constants.US_PER_S
         self.due_us = due_us if limit_s > 0.0 and time_us < due_us else math.inf
         if limit_s > 0.0 and time_us >= due_us:
             return (
@@ -75,7 +74,7 @@ class AutoDisarm:
         return None
 
 
-REFUSAL_US = 2 * US_PER_S
+REFUSAL_US = 2 * constants.US_PER_S
 """Time within which a rejected setpoint explains the loss of offboard [µs]."""
 
 
@@ -96,7 +95,7 @@ class FlightCommander:
         self,
         commanded: Commanded,
         newest: NewestSensors,
-        state: Vector,
+        state: frames.Vector,
         say: Callable[[OperatorText], None],
     ) -> None:
         """Boot.

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.control.loops import Motors
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import HOME, Vector, local_to_geodetic
+from airl_mav.core import constants, frames
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent, SensorFailure, SensorType
@@ -28,10 +27,10 @@ from firmware_sim.engine.record import MAG as MAG_BIT
 from firmware_sim.engine.record import PRESSURE as PRESSURE_BIT
 from firmware_sim.interfaces import GpsFix, SensorSample
 
-NO_DATA_US = US_PER_S
+NO_DATA_US = constants.US_PER_S
 """Timeout after which a silent sensor has no valid data [µs]."""
 
-LEARN_US = US_PER_S
+LEARN_US = constants.US_PER_S
 """Time at rest without repetition after which a sensor counts as noisy [µs]."""
 
 
@@ -277,7 +276,7 @@ class NewestSensors:
             place, velocity = self._record["gps_position"][0], self._record["gps_velocity"][0]
             self._fix_us = seen_us
             self._fix = self._fix._replace(
-                position=local_to_geodetic(place, HOME), velocity_ned=velocity.copy()
+                position=frames.local_to_geodetic(place, frames.HOME), velocity_ned=velocity.copy()
             )
         return self._fix
 
@@ -293,9 +292,9 @@ class NewestSensors:
         return None if self._read or self._sample is None else self._sample.esc_outputs
 
     @property
-    def mag(self) -> Vector:
+    def mag(self) -> frames.Vector:
         """Magnetic field (3,) FRD [gauss]."""
-        field: Vector = self._record["mag"][0].copy()
+        field: frames.Vector = self._record["mag"][0].copy()
         return field
 
     @property

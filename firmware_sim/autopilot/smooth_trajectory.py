@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from airl_mav.control.demand import TrajectoryDemand
-from airl_mav.core.constants import DEG, US_PER_S
-from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
+from airl_mav.core import constants, frames
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 
@@ -397,15 +396,15 @@ class Travel:
         self.speed_m_s = math.nan
         """Horizontal speed by MAV_CMD_DO_CHANGE_SPEED or similar; NaN = MPC_XY_CRUISE."""
 
-    def launch(self, state: Vector, time_us: int, climb_m_s: float) -> None:
+    def launch(self, state: frames.Vector, time_us: int, climb_m_s: float) -> None:
         """Start at a vehicle about to leave the ground with a climb rate [m/s]."""
         self._trajectory.restart(triple(state, P), (0.0, 0.0, -climb_m_s))
-        self._yaw, self._yaw_rate, self._wanted_yaw = quat_yaw(state[Q:RATES]), 0.0, None
+        self._yaw, self._yaw_rate, self._wanted_yaw = frames.quat_yaw(state[Q:RATES]), 0.0, None
         self._time_us = time_us
 
     def fly(
         self,
-        state: Vector,
+        state: frames.Vector,
         time_us: int,
         leg: PathSegment,
         *,
@@ -418,14 +417,14 @@ class Travel:
         the parameters.
         """
         position, velocity = triple(state, P), triple(state, V)
-        now = quat_yaw(state[Q:RATES])
+        now = frames.quat_yaw(state[Q:RATES])
         # After a pause the old trajectory is elsewhere.
         if self._time_us is None or time_us - self._time_us > PAUSE_US:
             self._trajectory.restart(position, velocity)
             self._yaw, self._yaw_rate, self._wanted_yaw = now, 0.0, None
             elapsed_s = 0.0
         else:
-            elapsed_s = (time_us - self._time_us) / US_PER_S
+            elapsed_s = (time_us - self._time_us) / constants.US_PER_S
         self._time_us = time_us
         path = self._trajectory
         path.advance(position, leg, limits or self.limits(), elapsed_s)
@@ -464,11 +463,11 @@ class Travel:
 
     def _turn(self, yaw: float, elapsed_s: float) -> None:
         """Turn the heading setpoint, limited to MPC_YAWRAUTO_MAX."""
-        limit = self._value("MPC_YAWRAUTO_MAX") * DEG
+        limit = self._value("MPC_YAWRAUTO_MAX") * constants.DEG
         most = limit * elapsed_s
         # Turn on the shorter way.
-        step = min(most, max(-most, wrap_pi(yaw - self._yaw)))
-        self._yaw = wrap_pi(self._yaw + step)
+        step = min(most, max(-most, frames.wrap_pi(yaw - self._yaw)))
+        self._yaw = frames.wrap_pi(self._yaw + step)
         if elapsed_s > 0.0:
             # Low-pass: a step of the heading gives no jump of the rate.
             weight = elapsed_s / (elapsed_s + YAW_RATE_TAU_S)
@@ -476,7 +475,7 @@ class Travel:
             self._yaw_rate = min(limit, max(-limit, self._yaw_rate))
 
 
-def stopping_place(state: Vector, value: Callable[[str], float]) -> Vec:
+def stopping_place(state: frames.Vector, value: Callable[[str], float]) -> Vec:
     """Return the stopping point NED [m] at the current height.
 
     Source: PX4 1.16, Navigator::preproject_stop_point.
@@ -489,7 +488,7 @@ def stopping_place(state: Vector, value: Callable[[str], float]) -> Vec:
     return north + vn * distance_per_speed, east + ve * distance_per_speed, down
 
 
-def triple(state: Vector, start: int) -> Vec:
+def triple(state: frames.Vector, start: int) -> Vec:
     """Return three consecutive numbers of a state."""
     north, east, down = state[start : start + 3].tolist()
     return north, east, down

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from airl_mav.control import loops, memory
 from airl_mav.control.cascade import filters
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, Gains, TrajectoryDemand
-from airl_mav.control.loops import Motors
-from airl_mav.control.memory import reset_integrals, settle_gyro_filter
-from airl_mav.core.constants import TICK_S
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, frames
 from firmware_sim.engine.record import (
     ATTITUDE,
     IDLE,
@@ -28,11 +26,11 @@ _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
 class ControlSetpoints(NamedTuple):
     """Setpoints of the cascade's loops."""
 
-    attitude: Vector
+    attitude: frames.Vector
     """(4,) body -> NED."""
-    rates: Vector
+    rates: frames.Vector
     """(3,) FRD [rad/s]."""
-    velocity: Vector
+    velocity: frames.Vector
     """(3,) after limits, NED [m/s]."""
     thrust: float
     """Collective 0..1."""
@@ -57,12 +55,12 @@ class Controller:
         if cutoff_hz != self._gyro_cutoff_hz:
             # Filter states scale with the cutoff: unchanged states would multiply the measured
             # rates at a much higher cutoff.
-            settle_gyro_filter(self._memory, filters(gains, TICK_S).gyro)
+            memory.settle_gyro_filter(self._memory, filters(gains, constants.TICK_S).gyro)
             self._gyro_cutoff_hz = cutoff_hz
         self._keep(gains)
 
     def _keep(self, gains: Gains) -> None:
-        velocity, gyro, dgyro, yaw = filters(gains, TICK_S)
+        velocity, gyro, dgyro, yaw = filters(gains, constants.TICK_S)
         self._record["gains"], self._record["filters"] = tuple(gains), (velocity, *gyro, dgyro, yaw)
 
     def command(self, demand: AnyDemand | None) -> None:
@@ -89,7 +87,7 @@ class Controller:
             record["demand_kind"] = RATES
             wanted[:3], wanted[3] = demand
 
-    def fly(self, state: Vector, demand: AnyDemand) -> Motors:
+    def fly(self, state: frames.Vector, demand: AnyDemand) -> loops.Motors:
         """Run one tick; return the motor commands 0..1.
 
         `state` begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
@@ -102,12 +100,12 @@ class Controller:
 
     def rest(self) -> None:
         """Reset while the motors are stopped: no integrator windup, zero output."""
-        reset_integrals(self._memory)
+        memory.reset_integrals(self._memory)
         self._output[:] = 0.0
         self._output[_ATTITUDE] = 1.0
 
     @property
-    def motors(self) -> Motors:
+    def motors(self) -> loops.Motors:
         """Newest motor commands 0..1."""
         a, b, c, d = self._motors.tolist()
         return a, b, c, d

@@ -12,13 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.demand import Gains
-from airl_mav.control.memory import MEMORY_SIZE
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.power import PowerModel
-from firmware_sim.autopilot.error_state import N_STATES, ROW_SIZE
-from firmware_sim.autopilot.recovery import LOOK_BACK
-from firmware_sim.autopilot.yaw_estimator import LONGEST, MODEL_SIZE, N_MODELS, SHARED_SIZE, WINDOW
+from airl_mav.control import demand, memory
+from airl_mav.vehicle import airframe, power
+from firmware_sim.autopilot import error_state, recovery, yaw_estimator
 from firmware_sim.engine.dynamics import WIDTH
 
 Record = NDArray[Any]
@@ -63,8 +59,8 @@ _F, _I = np.float64, np.int64
 AIRCRAFT = np.dtype(
     [
         # Constants.
-        ("airframe", _F, len(Airframe._fields)),
-        ("power_model", _F, len(PowerModel._fields)),
+        ("airframe", _F, len(airframe.Airframe._fields)),
+        ("power_model", _F, len(power.PowerModel._fields)),
         ("pack", _F, 4),
         ("rotor_lag", _F),
         ("computer_w", _F),
@@ -150,10 +146,10 @@ CONTROLLER = np.dtype(
         ("rest_count", _I, 4),  # indices as in `alignment.IMU` etc.
         ("rest_sum", _F, 10),
         # Estimator.
-        ("state", _F, ROW_SIZE),
-        ("covariance", _F, (N_STATES, N_STATES)),
-        ("transition", _F, (N_STATES, N_STATES)),
-        ("process_noise", _F, N_STATES),
+        ("state", _F, error_state.ROW_SIZE),
+        ("covariance", _F, (error_state.N_STATES, error_state.N_STATES)),
+        ("transition", _F, (error_state.N_STATES, error_state.N_STATES)),
+        ("process_noise", _F, error_state.N_STATES),
         ("healthy", _I),
         ("baro_origin_m", _F),
         ("baro_variance", _F),
@@ -167,33 +163,33 @@ CONTROLLER = np.dtype(
         ("gps_variance", _F, 2),  # position, velocity
         ("gps_horizontal_us", _I),
         ("gps_vertical_us", _I),
-        ("gps_horizontal_h", _F, (4, N_STATES)),
-        ("gps_vertical_h", _F, (2, N_STATES)),
+        ("gps_horizontal_h", _F, (4, error_state.N_STATES)),
+        ("gps_vertical_h", _F, (2, error_state.N_STATES)),
         ("innovation4", _F, 4),
         ("variance4", _F, 4),
         ("innovation2", _F, 2),
         ("variance2", _F, 2),
         ("velocity_noise", _F),  # variance of GPS velocities, relative to the nominal one
         ("velocity_before", _F, 3),  # deviations of the newest fix; NaN = none yet
-        ("accelerations", _F, (LOOK_BACK, 3)),  # of the newest fixes
+        ("accelerations", _F, (recovery.LOOK_BACK, 3)),  # of the newest fixes
         ("fixes", _I),
-        ("felt_motion", _F, (WINDOW, 2)),  # see `yaw_estimator`
-        ("seen_motion", _F, (WINDOW, 2)),
+        ("felt_motion", _F, (yaw_estimator.WINDOW, 2)),  # see `yaw_estimator`
+        ("seen_motion", _F, (yaw_estimator.WINDOW, 2)),
         ("motions", _I),
         ("motion_variance", _F),
-        ("baro_h", _F, (1, N_STATES)),
-        ("heading_h", _F, (1, N_STATES)),
+        ("baro_h", _F, (1, error_state.N_STATES)),
+        ("heading_h", _F, (1, error_state.N_STATES)),
         ("innovation", _F, 1),
         ("variance", _F, 1),
-        ("yaw_models", _F, (N_MODELS, MODEL_SIZE)),
-        ("yaw_shared", _F, SHARED_SIZE),
-        ("yaw_gyro", _F, 3 * LONGEST),
-        ("yaw_accel", _F, 3 * LONGEST),
+        ("yaw_models", _F, (yaw_estimator.N_MODELS, yaw_estimator.MODEL_SIZE)),
+        ("yaw_shared", _F, yaw_estimator.SHARED_SIZE),
+        ("yaw_gyro", _F, 3 * yaw_estimator.LONGEST),
+        ("yaw_accel", _F, 3 * yaw_estimator.LONGEST),
         ("yaw_count", _I),
         # Control.
-        ("gains", [(name, _F) for name in Gains._fields]),
+        ("gains", [(name, _F) for name in demand.Gains._fields]),
         ("filters", _F, FILTERS_SIZE),  # `cascade.filters` of the gains
-        ("memory", _F, MEMORY_SIZE),
+        ("memory", _F, memory.MEMORY_SIZE),
         ("demand_kind", _I),
         ("demand", _F, DEMAND_SIZE),
         ("output", _F, OUTPUT_SIZE),
@@ -224,7 +220,7 @@ FLOWN_TICK = np.dtype(
     [
         ("time_us", _I),
         ("healthy", _I),
-        ("state", _F, ROW_SIZE),
+        ("state", _F, error_state.ROW_SIZE),
         ("accel", _F, 3),
         ("gyro", _F, 3),
         ("mag", _F, 3),
@@ -267,6 +263,6 @@ def new_controller() -> Record:
     record["velocity_noise"] = 1.0
     # NaN: the first pressure never counts as a repetition.
     record["pressure_hpa"] = np.nan
-    record["transition"] = np.eye(N_STATES)
+    record["transition"] = np.eye(error_state.N_STATES)
     record["demand_kind"] = IDLE
     return record

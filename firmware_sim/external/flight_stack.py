@@ -12,18 +12,15 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
-from firmware_sim import interfaces
+from firmware_sim import interfaces, simulation
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.commander import CommanderState
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.parameters import GROUND_LOSS, differences
 from firmware_sim.external.programs import firmware_kind
+from firmware_sim.mavlink import link, px4_links, traffic
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.mavlink.link import LinkCounters
-from firmware_sim.mavlink.px4_links import UdpLinks
-from firmware_sim.mavlink.traffic import TlogWriter
-from firmware_sim.simulation import EpisodeSetup
 
 ASK_EVERY_S = 0.25
 """Interval of repeated requests for missing parameters [wall s]."""
@@ -49,7 +46,7 @@ class FirmwareRequest:
     vehicle: VehicleProfile
     log: Path | None
     """Log file for the firmware's output; None = a file in its folder."""
-    bind_ends: Callable[[], UdpLinks]
+    bind_ends: Callable[[], px4_links.UdpLinks]
     """Bind the vehicle's ends of the links, if not bound by the firmware."""
 
 
@@ -151,7 +148,7 @@ class ExternalFlightStack:
         self.filenos = observer.filenos
         self._look_every_us, self._look_us = look_every_us, 0
         self.send = observer.send
-        self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
+        self.counters: Callable[[], dict[str, link.LinkCounters]] = observer.counters
 
     def next_send_us(self) -> float:
         """Return 0: `send` is called after every tick."""
@@ -164,7 +161,7 @@ class ExternalFlightStack:
         self._look_us = now_us + self._look_every_us
         return self._observer.receive(now_us)
 
-    def log_to(self, tlog: TlogWriter | None) -> None:
+    def log_to(self, tlog: traffic.TlogWriter | None) -> None:
         """Log the observer's link to a tlog. The firmware's flight log is copied beside it."""
         self._observer.log_to(tlog)
         if tlog is not None:
@@ -174,7 +171,7 @@ class ExternalFlightStack:
         """Return an empty tuple: traffic on the firmware's links is not inspected."""
         return ()
 
-    def boot(self, setup: EpisodeSetup) -> ExternalFlightController:
+    def boot(self, setup: simulation.EpisodeSetup) -> ExternalFlightController:
         """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
         del setup  # Each start is a power-up without state of an earlier flight.
         self._observer.restart()

@@ -10,9 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, TypeAlias
 
-from airl_mav.core.constants import DEG, GRAVITY_M_S2, US_PER_S
-from airl_mav.core.errors import PAGE
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, errors, frames
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim import interfaces
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
@@ -74,8 +72,8 @@ _DEGREES = 1e7
 _MM = 1e3
 _CM = 1e2
 
-ACCEL_LIMIT_M_S2 = 32_767 / 2048 * GRAVITY_M_S2
-GYRO_LIMIT_RAD_S = 32_767 / 32_768 * 2000.0 * DEG
+ACCEL_LIMIT_M_S2 = 32_767 / 2048 * constants.GRAVITY_M_S2
+GYRO_LIMIT_RAD_S = 32_767 / 32_768 * 2000.0 * constants.DEG
 """Range of the inertial sensors simulated by PX4's drivers: 16 g, 2000 deg/s in 16 bits. Values
 beyond would wrap around: a hard landing (0.7 m/s stopped within a tick) would look like a fall."""
 
@@ -174,7 +172,7 @@ def flow(told: interfaces.FlowReading, time_us: int) -> Values:
     return (
         time_us,
         _ID,
-        _fit(told.interval_s * US_PER_S, (0, 2**32 - 1)),
+        _fit(told.interval_s * constants.US_PER_S, (0, 2**32 - 1)),
         *told.flow.tolist(),
         *told.turned.tolist(),
         temperature,
@@ -218,17 +216,17 @@ def controls(message: Controls, time_us: int) -> interfaces.ActuatorControls:
         if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
             raise ControlsError(
                 f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}: accepted: 0..1 from the motors "
-                f"of a quadrotor ({PAGE})"
+                f"of a quadrotor ({errors.PAGE})"
             )
     a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
     return interfaces.ActuatorControls(time_us, (a, b, c, d), armed=True)
 
 
-def _known(values: Vector | None, width: int) -> tuple[float, ...]:
+def _known(values: frames.Vector | None, width: int) -> tuple[float, ...]:
     return (math.nan,) * width if values is None else tuple(values.tolist())
 
 
-def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:
+def _saturated(measured: frames.Vector, limit: float) -> tuple[float, float, float]:
     x, y, z = measured.tolist()
     if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
         return x, y, z

@@ -14,9 +14,7 @@ from typing import Protocol
 
 import psutil
 
-from airl_mav.core.child_process import ChildProcess
-from airl_mav.core.clock import Patience
-from airl_mav.core.files import PARTIAL_SUFFIX
+from airl_mav.core import child_process, clock, files
 from firmware_sim import interfaces
 from firmware_sim.external.parameters import RequiredAirframe
 
@@ -147,7 +145,7 @@ class Launcher:
         )
         if path is None or written is None:
             return
-        partial = path.with_name(path.name + PARTIAL_SUFFIX)
+        partial = path.with_name(path.name + files.PARTIAL_SUFFIX)
         try:
             shutil.copyfile(written, partial)
             partial.replace(path)
@@ -196,7 +194,7 @@ class RunningProgram:
 
     def settle(self) -> bool:
         """Wait until the threads found at the first call sleep; False if unknown or timed out."""
-        patience, looks = Patience(), 0
+        patience, looks = clock.Patience(), 0
         while looks < LOOKS:
             asleep = self._all_asleep()
             if asleep is None:
@@ -272,7 +270,7 @@ class StartCommand:
     """Variables added to the environment of this process."""
 
 
-class FirmwareProcess(ChildProcess):
+class FirmwareProcess(child_process.ChildProcess):
     """Process of external firmware. It ends with this process, even if killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from airl_mav.core.errors import PAGE, UsageError
-from airl_mav.core.files import replace_file
+from airl_mav.core import errors, files
 from airl_mav.profiles.parameters import SPEC_BY_NAME
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE, Corner, VehicleProfile
 from firmware_sim.interfaces import FirmwareMissingError
@@ -59,7 +58,7 @@ class KeptParameters:
         except FileNotFoundError:
             return {}
         except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"{self._path}: cannot be read: {error}") from None
+            raise errors.UsageError(f"{self._path}: cannot be read: {error}") from None
         values: dict[str, int | float] = {}
         for number, line in enumerate(lines, start=1):
             if not line.strip() or line.startswith("#"):
@@ -70,7 +69,7 @@ class KeptParameters:
                 spec = SPEC_BY_NAME.get(name)
                 value = int(text) if spec and isinstance(spec.default, int) else float(text)
             except ValueError:
-                raise UsageError(
+                raise errors.UsageError(
                     f"{self._path}: line {number}: accepted: {_COLUMNS} columns between tabs, "
                     f"vehicle, component, name, value, type; has {line!r}"
                 ) from None
@@ -80,7 +79,7 @@ class KeptParameters:
 
     def write(self, values: Mapping[str, int | float]) -> None:
         """Replace the stored parameters. Raises OSError if the file cannot be written."""
-        replace_file(self._path, qgroundcontrol_file(values).encode())
+        files.replace_file(self._path, qgroundcontrol_file(values).encode())
 
 
 Value = int | float
@@ -162,7 +161,7 @@ def _px4_problem(motors: Sequence[Corner], output: str, held: Mapping[str, Value
     if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
         return (
             f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
-            f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4 ({PAGE})"
+            f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4 ({errors.PAGE})"
         )
     for number, expected in enumerate(motors, start=1):
         name = output.format(number)

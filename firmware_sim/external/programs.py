@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from airl_mav.core.addons import load_entry
-from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.errors import UsageError
+from airl_mav.core import addons, constants, errors
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
-from firmware_sim.external import parameters
-from firmware_sim.external.launcher import StartCommand
+from firmware_sim.external import launcher, parameters
 from firmware_sim.interfaces import FirmwareMissingError
 
 
@@ -42,7 +39,7 @@ def firmware_kind(name: str) -> FirmwareKind:
     if name == "px4":
         return PX4
     option = "firmware", name
-    kind: FirmwareKind = load_entry(
+    kind: FirmwareKind = addons.load_entry(
         "firmware_sim", "FIRMWARE", name, option, name.replace("-", "_")
     )
     return kind
@@ -102,14 +99,14 @@ class Px4Program:
     binary: Path
     etc: Path
 
-    def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
+    def start(self, instance: int, airframe: int, folder: Path) -> launcher.StartCommand:
         """Return the command to start an instance with an airframe (SYS_AUTOSTART)."""
         argv = [
             str(self.binary),
             *("-d", "-i", str(instance)),
             *("-w", str(folder), "-s", SCRIPT, str(self.etc)),
         ]
-        return StartCommand(argv, environment(airframe))
+        return launcher.StartCommand(argv, environment(airframe))
 
 
 def find_px4(folder: Path) -> Px4Program:
@@ -132,7 +129,7 @@ def environment(airframe: int) -> dict[str, str]:
 
 def check_free(instance: int) -> None:
     """Raise UsageError if a port required by PX4 or its bridge is taken."""
-    simulator = (socket.SOCK_STREAM, LOOPBACK, SIMULATOR_PORT + instance)
+    simulator = (socket.SOCK_STREAM, constants.LOOPBACK, SIMULATOR_PORT + instance)
     # PX4 binds its ports on all interfaces.
     links = ((socket.SOCK_DGRAM, "", port + instance) for port in LOCAL_PORTS)
     for kind, host, port in (simulator, *links):
@@ -143,7 +140,7 @@ def check_free(instance: int) -> None:
                 trial.bind((host, port))
             except OSError as error:
                 name = "TCP" if kind == socket.SOCK_STREAM else "UDP"
-                raise UsageError(
+                raise errors.UsageError(
                     f"{name} port {port}, which PX4 of instance {instance} needs, is taken "
                     "(another simulator, or airl-firmware?): choose another with --instance"
                 ) from error

@@ -13,19 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from airl_mav.core.clock import Patience
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.scheduling import ask_for_short_slices
+from airl_mav.core import clock, constants, errors, scheduling
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
-from firmware_sim.external import flight_stack
-from firmware_sim.external.observer import SYSTEM_ID, FirmwareObserver
-from firmware_sim.external.programs import API_LOCAL_PORT, API_PORT, check_free, find_px4
-from firmware_sim.external.px4_sitl import Px4Bridge, px4_parts
+from firmware_sim.external import flight_stack, observer, programs, px4_sitl
 from firmware_sim.interfaces import FirmwareLostError
-from firmware_sim.mavlink.codec import Encoder, dialect
-from firmware_sim.mavlink.px4_links import UdpLinks
+from firmware_sim.mavlink import codec, px4_links
 
 ECHO_S = 60.0
 """Timeout of an echo [wall s, while this process runs]."""
@@ -33,14 +26,14 @@ ECHO_S = 60.0
 PING_AGAIN_S = 0.1
 """Interval of repeated PINGs without a reply [wall s]."""
 
-COMPONENT_ID = dialect.MAV_COMP_ID_USER2
+COMPONENT_ID = codec.dialect.MAV_COMP_ID_USER2
 """MAVLink component id of the sender of PINGs, to which PX4 addresses the reply."""
 
 _MARKER, _ID, _PAYLOAD = 0xFD, slice(7, 10), 10
-_PING: bytes = dialect.MAVLINK_MSG_ID_PING.to_bytes(3, "little")
+_PING: bytes = codec.dialect.MAVLINK_MSG_ID_PING.to_bytes(3, "little")
 _SEQUENCE = slice(_PAYLOAD + 8, _PAYLOAD + 12)
 _TARGET = slice(_PAYLOAD + 12, _PAYLOAD + 14)
-_US = bytes([SYSTEM_ID, COMPONENT_ID])
+_US = bytes([observer.SYSTEM_ID, COMPONENT_ID])
 
 
 class OnboardLink:
@@ -49,10 +42,10 @@ class OnboardLink:
     def __init__(self, instance: int, alive: Callable[[], None]) -> None:
         """Bind the port of an instance; `alive` is polled in waits and raises if PX4 is lost."""
         self._endpoint = flight_stack.instance_endpoint(
-            API_PORT + instance, API_LOCAL_PORT + instance
+            programs.API_PORT + instance, programs.API_LOCAL_PORT + instance
         )
         self._alive = alive
-        self._encoder = Encoder(SYSTEM_ID, COMPONENT_ID)
+        self._encoder = codec.Encoder(observer.SYSTEM_ID, COMPONENT_ID)
         self._echoes = 0
         self._heard: deque[bytes] = deque()
 
@@ -78,12 +71,12 @@ class OnboardLink:
         receiver for some milliseconds of simulated time.
         """
         number = self._echoes = (self._echoes + 1) & 0xFFFF_FFFF
-        ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))
+        ping = self._encoder.pack(codec.dialect.MAVLink_ping_message(0, number, 0, 0))
         wanted = number.to_bytes(4, "little")
         socket = self._endpoint.fileno()
         if socket is None:
             raise FirmwareLostError("the companion's link to PX4 is closed")
-        waited, again_s = Patience(), 0.0
+        waited, again_s = clock.Patience(), 0.0
         while (so_far_s := waited.so_far_s()) < ECHO_S:
             if so_far_s >= again_s:
                 self._endpoint.send(ping)
@@ -114,11 +107,11 @@ ANSWER_S = 60.0
 """Timeout of PX4's reply to a sample [wall s, while this process runs]."""
 
 
-STATE_US = US_PER_S // 5
+STATE_US = constants.US_PER_S // 5
 """Minimum interval of the true state [µs]. PX4 requests 5 ms, only for its log."""
 
 
-LOOK_US = US_PER_S // 50
+LOOK_US = constants.US_PER_S // 50
 """Interval at which the observer's link is read [µs]; no message on it is faster."""
 
 
@@ -141,38 +134,38 @@ def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None)
     flights use different instances. `log` receives PX4's output; None = a file in its folder.
     Raises UsageError if no instance is free or the program does not exist.
     """
-    ask_for_short_slices()
+    scheduling.ask_for_short_slices()
     real = aircraft.real
     request = flight_stack.FirmwareRequest(aircraft, vehicle, log, _no_ends)
     if real.px4_dir is None:
         return _instance(request, real.instance)
-    find_px4(real.px4_dir)
-    taken: UsageError | None = None
+    programs.find_px4(real.px4_dir)
+    taken: errors.UsageError | None = None
     for instance in range(real.instance, GREATEST_INSTANCE + 1):
         # Bind first, so that two concurrent processes do not take the same instance.
         try:
             found = _instance(request, instance)
-        except UsageError as error:
+        except errors.UsageError as error:
             taken = error
             continue
         try:
-            check_free(instance)
-        except UsageError as error:
+            programs.check_free(instance)
+        except errors.UsageError as error:
             taken = error
             found.stack.close()
             continue
         return found
-    raise UsageError(
+    raise errors.UsageError(
         f"no instance of PX4's from {real.instance} to {GREATEST_INSTANCE} is free (other "
         "simulators?): choose another with --instance, or fewer workers"
     ) from taken
 
 
 def _instance(request: flight_stack.FirmwareRequest, instance: int) -> ConductedPx4:
-    newest: list[Px4Bridge] = []
+    newest: list[px4_sitl.Px4Bridge] = []
 
-    def bridge(port: int) -> Px4Bridge:
-        newest[:] = [Px4Bridge(port, answer_s=ANSWER_S, least_state_us=STATE_US)]
+    def bridge(port: int) -> px4_sitl.Px4Bridge:
+        newest[:] = [px4_sitl.Px4Bridge(port, answer_s=ANSWER_S, least_state_us=STATE_US)]
         return newest[0]
 
     def alive() -> None:
@@ -183,16 +176,16 @@ def _instance(request: flight_stack.FirmwareRequest, instance: int) -> Conducted
         for each in newest:
             each.settle()
 
-    launcher, endpoint = px4_parts(request, instance, bridge)
+    launcher, endpoint = px4_sitl.px4_parts(request, instance, bridge)
     try:
         link = OnboardLink(instance, alive)
-    except UsageError:
+    except errors.UsageError:
         endpoint.close()
         launcher.close()
         raise
     stack = flight_stack.ExternalFlightStack(
         launcher,
-        FirmwareObserver(endpoint, "observer", request.vehicle.told_origin),
+        observer.FirmwareObserver(endpoint, "observer", request.vehicle.told_origin),
         request.aircraft.real.firmware_timeout,
         on_close=link.close,
         look_every_us=LOOK_US,
@@ -200,5 +193,5 @@ def _instance(request: flight_stack.FirmwareRequest, instance: int) -> Conducted
     return ConductedPx4(stack, link, settle, instance)
 
 
-def _no_ends() -> UdpLinks:
+def _no_ends() -> px4_links.UdpLinks:
     raise RuntimeError("PX4 SITL binds its own ends of its links")

@@ -14,13 +14,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Patience, WallClock
-from airl_mav.core.constants import LOOPBACK, MS_PER_S, TICK_HZ, TICK_US, US_PER_S
-from airl_mav.core.errors import UsageError
 from firmware_sim import interfaces
+from firmware_sim.external import flight_stack, parameters, programs
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.external import programs
-from firmware_sim.external.flight_stack import FirmwareRequest, instance_endpoint
 from firmware_sim.external.launcher import (
     Launcher,
     RunningProgram,
@@ -28,7 +26,6 @@ from firmware_sim.external.launcher import (
     no_process,
     program_at,
 )
-from firmware_sim.external.parameters import SITL_OUTPUT, px4_airframe
 from firmware_sim.mavlink.codec import Decoder, Encoder, Values, WireLayout, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.streams.status import hil_state_quaternion
@@ -54,11 +51,11 @@ class TcpPort:
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._listener.setblocking(False)
         try:
-            self._listener.bind((LOOPBACK, port))
+            self._listener.bind((constants.LOOPBACK, port))
             self._listener.listen()
         except (OSError, OverflowError) as error:
             self._listener.close()
-            raise UsageError(_listen_problem(port, error)) from error
+            raise errors.UsageError(_listen_problem(port, error)) from error
         self.port: int = self._listener.getsockname()[1]
         self._poll = select.poll()
         self._poll.register(self._listener, _READ)
@@ -71,7 +68,7 @@ class TcpPort:
             left_s = self._left_s(deadline_us)
             if left_s <= 0.0:
                 return False
-            if self._poll.poll(min(left_s, WATCH_S) * MS_PER_S):
+            if self._poll.poll(min(left_s, WATCH_S) * constants.MS_PER_S):
                 self._connection = self._newcomer()
         self._connection.setblocking(False)
         self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -99,14 +96,14 @@ class TcpPort:
             alive()
             writable = select.poll()
             writable.register(connection, _WRITE)
-            writable.poll(min(left_s, WATCH_S) * MS_PER_S)
+            writable.poll(min(left_s, WATCH_S) * constants.MS_PER_S)
             sent = _send(connection, left)
         return False
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Return received data, b"" after a timeout [wall s] or earlier, None at the end."""
         connection = self._connected()
-        for number, _ in self._poll.poll(timeout_s * MS_PER_S):
+        for number, _ in self._poll.poll(timeout_s * constants.MS_PER_S):
             if number == connection.fileno():
                 try:
                     return connection.recv(CHUNK) or None
@@ -139,10 +136,10 @@ class TcpPort:
             return None
 
     def _deadline_us(self, timeout_s: float) -> int:
-        return self._clock.time_us() + int(timeout_s * US_PER_S)
+        return self._clock.time_us() + int(timeout_s * constants.US_PER_S)
 
     def _left_s(self, deadline_us: int) -> float:
-        return (deadline_us - self._clock.time_us()) / US_PER_S
+        return (deadline_us - self._clock.time_us()) / constants.US_PER_S
 
 
 def _send(connection: socket.socket, data: bytes) -> int | None:
@@ -156,7 +153,7 @@ def _send(connection: socket.socket, data: bytes) -> int | None:
 
 
 def _listen_problem(port: int, error: OSError | OverflowError) -> str:
-    where = f"TCP port {port} on {LOOPBACK}"
+    where = f"TCP port {port} on {constants.LOOPBACK}"
     if isinstance(error, OverflowError):
         return f"--instance: {where}: must be in 0..65535"
     if error.errno == errno.EADDRINUSE:
@@ -182,7 +179,7 @@ AT_ONCE_S = 0.01
 START_S = 60.0
 """Timeout from the first sample to the first reply [wall s], while PX4's start script runs."""
 
-EPOCH_US = US_PER_S
+EPOCH_US = constants.US_PER_S
 """PX4's time of the first sample [µs]; PX4 reads 0 as never."""
 
 STATE_US = 200_000
@@ -217,7 +214,7 @@ class Px4Bridge:
     (`FirmwareLostError`). Duplicate replies are dropped, additional connections refused.
     """
 
-    rate_hz = TICK_HZ
+    rate_hz = constants.TICK_HZ
 
     def __init__(
         self,
@@ -327,11 +324,11 @@ class Px4Bridge:
         """Wait for the next sample's wall time or PX4's first reply, to keep queues short."""
         clock = self._clock
         while (wait_us := self._pace_us - clock.time_us()) > 0 and self._answer is None:
-            self._receive(min(wait_us / US_PER_S, WATCH_S))
+            self._receive(min(wait_us / constants.US_PER_S, WATCH_S))
         now_us = clock.time_us()
-        self._pace_us = now_us + TICK_US
+        self._pace_us = now_us + constants.TICK_US
         self._alive()
-        if now_us - self._began_us > self._start_s * US_PER_S:
+        if now_us - self._began_us > self._start_s * constants.US_PER_S:
             raise self._lost(
                 f"connected, but answered none of {self.unanswered} samples in {self._start_s:g} s"
             )
@@ -460,11 +457,11 @@ class Px4Bridge:
 
 
 def _seconds(time_us: int) -> str:
-    return f"{time_us / US_PER_S:.3f} s"
+    return f"{time_us / constants.US_PER_S:.3f} s"
 
 
 def px4_parts(
-    request: FirmwareRequest,
+    request: flight_stack.FirmwareRequest,
     instance: int | None = None,
     bridge: Callable[[int], Px4Bridge] = Px4Bridge,
 ) -> tuple[Launcher, Endpoint]:
@@ -479,9 +476,9 @@ def px4_parts(
         if options.px4_dir is not None:
             # With a taken port, PX4 would start without its links, or not at all, in every flight.
             programs.check_free(instance)
-    airframe = px4_airframe(request.vehicle, SITL_OUTPUT)
+    airframe = parameters.px4_airframe(request.vehicle, parameters.SITL_OUTPUT)
     program = None if options.px4_dir is None else programs.find_px4(options.px4_dir)
-    endpoint = instance_endpoint(
+    endpoint = flight_stack.instance_endpoint(
         programs.PAYLOAD_PORT + instance, programs.PAYLOAD_LOCAL_PORT + instance
     )
     launcher = Launcher(

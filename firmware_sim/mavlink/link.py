@@ -10,12 +10,9 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
-from firmware_sim.mavlink import codec
+from firmware_sim.mavlink import codec, message_rates, px4_links, telemetry
 from firmware_sim.mavlink.endpoint import Sender
-from firmware_sim.mavlink.message_rates import StreamScheduler, interval_us
-from firmware_sim.mavlink.px4_links import LinkConfig
 from firmware_sim.mavlink.streams import Builder
-from firmware_sim.mavlink.telemetry import NUMBERS, Packer
 from firmware_sim.mavlink.telemetry import payload as fast_payload
 
 Payloads = dict[Builder, "bytes | None"]
@@ -65,7 +62,7 @@ class Link:
 
     def __init__(
         self,
-        config: LinkConfig,
+        config: px4_links.LinkConfig,
         builders: Mapping[str, Builder | None],
         replies: Mapping[str, Builder | None] | None = None,
         *,
@@ -83,13 +80,13 @@ class Link:
         self.builders = builders
         # Configured streams come first: their order is the order within a tick.
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
-        self.scheduler = StreamScheduler(
+        self.scheduler = message_rates.StreamScheduler(
             names,
-            {name: interval_us(hz) for name, hz in config.rates_hz.items()},
-            NUMBERS,
+            {name: message_rates.interval_us(hz) for name, hz in config.rates_hz.items()},
+            telemetry.NUMBERS,
             config.slow_every_us,
         )
-        self._packer = Packer()
+        self._packer = telemetry.Packer()
         self.tap: Callable[[Sequence[bytes]], None] | None = None
         """Callback for the frames of both directions; None = disabled."""
         self.ignored = 0

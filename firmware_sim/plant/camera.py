@@ -30,9 +30,7 @@ from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
 from airl_mav.camera.render import Motion, Mount, camera_pose, colour, exposure_by
-from airl_mav.core.constants import TICK_US
-from airl_mav.core.errors import UsageError
-from airl_mav.core.scheduling import give_way
+from airl_mav.core import constants, errors, scheduling
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.projections import Renderer
 from airl_mav.profiles.vehicle import SensorNoise
@@ -176,7 +174,7 @@ class SimulatedCamera:
     def skip_unread(self, read_us: int) -> None:
         """Skip due frames that newer ones replace before `read_us`; see `OnboardCamera`."""
         # The next frame is exposed at the first tick after its slot.
-        last_us = read_us - self._rate.period_us - TICK_US
+        last_us = read_us - self._rate.period_us - constants.TICK_US
         while self.next_us < last_us and not self._in_order:
             self._schedule_next(self.next_us)
 
@@ -238,10 +236,10 @@ class CameraServer:
             self.close()
             if error.errno == zmq.EADDRINUSE:
                 port = endpoint.rsplit(":", 1)[-1]
-                raise UsageError(
+                raise errors.UsageError(
                     f"camera port {port} is taken ({endpoint}); choose another with --camera-port"
                 ) from error
-            raise UsageError(
+            raise errors.UsageError(
                 f"camera endpoint {endpoint!r}: {error}; accepted: tcp://ADDRESS:PORT, ipc://PATH"
             ) from error
         self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
@@ -420,7 +418,7 @@ class SlowCamera:
 
 def main(number: int) -> None:
     """Process requests on a connection, given by its file descriptor, until it closes."""
-    give_way(NICENESS)
+    scheduling.give_way(NICENESS)
     line = Connection(number)
     with suppress(EOFError, OSError):
         # Each episode begins with its camera.

@@ -8,11 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.addons import entries, load
-from airl_mav.core.constants import TICK_HZ, US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import Vector
-from airl_mav.core.streams import sensors_and_gusts
+from airl_mav.core import addons, constants, errors, frames, streams
 from airl_mav.profiles.vehicle import BodyProfile as BodyProfile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, PlantName
@@ -20,6 +16,7 @@ from airl_mav.vehicle.airframe import Airframe, lag
 from airl_mav.vehicle.atmosphere import Wind
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
+from firmware_sim import interfaces, sensor_table
 from firmware_sim.autopilot.climb import climb_record
 from firmware_sim.engine import dynamics
 from firmware_sim.engine.record import Record, new_aircraft
@@ -41,10 +38,8 @@ from firmware_sim.engine.ticks import (
     rest_record,
     stretch,
 )
-from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, TrueState
 from firmware_sim.plant.body import BREAKING_SHARE, FLOOR, PlantBody, Room, Touch
 from firmware_sim.plant.sensors import SensorSuite, SimulatedSensor, Site
-from firmware_sim.sensor_table import add_readings, fitted
 
 BODIES = {"pybullet": "firmware_sim.plant.bullet_body:BulletBody"}
 """Classes of bodies by name; add-ons have more. Imported on first use: pybullet is not available
@@ -58,10 +53,10 @@ def new_body(
 
     Without an arena the floor is endless. Raises UsageError for an unknown name.
     """
-    place = BODIES.get(name) or entries("firmware_sim", "BODIES").get(name)
+    place = BODIES.get(name) or addons.entries("firmware_sim", "BODIES").get(name)
     if place is None:
-        raise UsageError(f"--plant {name}: no add-on of firmware_sim has this plant")
-    made: PlantBody = load(place)(arena, body, airframe, tick_s)
+        raise errors.UsageError(f"--plant {name}: no add-on of firmware_sim has this plant")
+    made: PlantBody = addons.load(place)(arena, body, airframe, tick_s)
     return made
 
 
@@ -84,7 +79,7 @@ STOPPED: dynamics.Speeds = (0.0, 0.0, 0.0, 0.0)
 class Blowing(Protocol):
     """Source of wind; see `vehicle.atmosphere.Wind`."""
 
-    def step(self) -> Vector:
+    def step(self) -> frames.Vector:
         """Advance one tick and return the wind (3,) NED [m/s]; read-only."""
 
 
@@ -109,7 +104,7 @@ class Plant:
         start_us: int = 0,
         aircraft: Aircraft | None = None,
         airframe: Airframe | None = None,
-        rate_hz: int = TICK_HZ,
+        rate_hz: int = constants.TICK_HZ,
         computer_w: float = 0.0,
     ) -> None:
         """Place the vehicle at rest on the floor at the start, facing north.
@@ -132,7 +127,7 @@ class Plant:
         self.record = record = new_aircraft()
         """Record of body, rotors, battery and sensors."""
         # Separate streams: wind does not depend on the sensors.
-        noise, gusts = sensors_and_gusts(rng)
+        noise, gusts = streams.sensors_and_gusts(rng)
         self._sensors = SensorSuite(
             profile.sensors, noise, tick_s, asked.sensors.navigation_noise, record
         )
@@ -142,11 +137,11 @@ class Plant:
         """Wind NED [m/s] of the coming ticks. A single row is constant wind."""
         self._auxiliary: list[tuple[str, SimulatedSensor]] = []
         """Sensors that measure in Python, with the names of their readings."""
-        for kind, settings in fitted(profile.sensors).values():
+        for kind, settings in sensor_table.fitted(profile.sensors).values():
             # An additional child leaves the random streams of the other sensors unchanged.
             own = self._sensors.spare if kind.draws_always else noise.spawn(1)[0]
             site = Site(arena, own, asked.sensors.navigation_noise, tick_s)
-            self._auxiliary.append((kind.reading, load(kind.simulation)(settings, site)))
+            self._auxiliary.append((kind.reading, addons.load(kind.simulation)(settings, site)))
         model = PowerModel.from_profile(profile)
         self.rotor_lag = lag(airframe, tick_s)
         """Fraction of a rotor speed error that remains after a tick."""
@@ -191,7 +186,7 @@ class Plant:
         return self.record["time_us"].item(0)
 
     @property
-    def motion(self) -> Vector:
+    def motion(self) -> frames.Vector:
         """Copy of the motion (16,), see `engine.dynamics`."""
         return self._motion.copy()
 
@@ -210,8 +205,8 @@ class Plant:
         return self.record["power_w"].item(0)
 
     @property
-    def _battery(self) -> BatterySample:
-        return BatterySample(*self.record["battery"][0].tolist())
+    def _battery(self) -> interfaces.BatterySample:
+        return interfaces.BatterySample(*self.record["battery"][0].tolist())
 
     @property
     def _elapsed_us(self) -> int:
@@ -321,7 +316,7 @@ class Plant:
                 return k + 1, NONE
         return ticks, NONE
 
-    def newest(self) -> SensorSample:
+    def newest(self) -> interfaces.SensorSample:
         """Return the newest sample of the compiled sensors."""
         return self._sensors.newest(self._battery)
 
@@ -331,7 +326,7 @@ class Plant:
         if isinstance(self.wind, Wind) and at[4] >= len(self._winds):
             self._winds, at[4] = self.wind.ahead(), 0
 
-    def _wind_now(self) -> Vector:
+    def _wind_now(self) -> frames.Vector:
         at = self.record["noise_at"][0]
         if len(self._winds) == 1:
             return self._winds[0]
@@ -355,13 +350,13 @@ class Plant:
 
     # --- ticks by Python
 
-    def step(self, controls: ActuatorControls) -> SensorSample:
+    def step(self, controls: interfaces.ActuatorControls) -> interfaces.SensorSample:
         """Apply motor commands for one tick and return the sensor sample after it."""
         wind = self._wind_now() if isinstance(self.wind, Wind) else self.wind.step()
         self._move(controls.motors, wind)
         return self.sense()
 
-    def _move(self, motors: dynamics.Speeds, wind: Vector) -> None:
+    def _move(self, motors: dynamics.Speeds, wind: frames.Vector) -> None:
         record = self.record
         # An empty battery stops the motors.
         motors = motors if record["charge"][0] > 0.0 else STOPPED
@@ -373,7 +368,7 @@ class Plant:
         if record["held"][0]:
             self._has_come_to_rest()
 
-    def _moved(self, here: Vec, force: Vec, torque: Vec) -> Vector:
+    def _moved(self, here: Vec, force: Vec, torque: Vec) -> frames.Vector:
         """Move the body by a tick; return the motion after it (16,), and update its contacts."""
         body, record, before = self.body, self.record, self._motion
         # `before` comes from compiled ticks, which the body has not seen.
@@ -384,7 +379,7 @@ class Plant:
             body.look_around()
         # From the tick count: periods of some rates are not whole microseconds.
         ticks, rate_hz = record["ticks"].item(0) + 1, record["rate_hz"].item(0)
-        time_us = record["start_us"].item(0) + ticks * US_PER_S // rate_hz
+        time_us = record["start_us"].item(0) + ticks * constants.US_PER_S // rate_hz
         after = body.move(here, force, torque, before, max(0, time_us - record["moves_us"].item(0)))
         if body.touch.close or self._touching:
             self._watch(body.touch, before, time_us)
@@ -406,7 +401,7 @@ class Plant:
         record["resting"] = resting = is_clear_record(record)
         return resting
 
-    def sense(self) -> SensorSample:
+    def sense(self) -> interfaces.SensorSample:
         """Return a sensor sample of the current state."""
         time_us = self.time_us
         sample, readings = self._sensors.sample(time_us, self._motion, self._battery), {}
@@ -414,12 +409,12 @@ class Plant:
             reading = sensor.sense(time_us, self.motion, self._elapsed_us)
             if reading is not None:
                 readings[name] = reading
-        return add_readings(sample, readings) if readings else sample
+        return sensor_table.add_readings(sample, readings) if readings else sample
 
-    def truth(self) -> TrueState:
+    def truth(self) -> interfaces.TrueState:
         """Return the true state."""
         row = self.motion.copy()
-        return TrueState(
+        return interfaces.TrueState(
             self.time_us,
             row[dynamics.POSITION],
             row[dynamics.VELOCITY],
@@ -442,7 +437,7 @@ class Plant:
         self.record["room_m"] = -math.inf
         self.collisions.clear()
 
-    def _watch(self, touch: Touch, before: Vector, time_us: int) -> None:
+    def _watch(self, touch: Touch, before: frames.Vector, time_us: int) -> None:
         """Latch every new contact at the end of a tick [µs]. A lasting contact is one event."""
         # Contacts flicker: a contact ends when the bodies are no longer close.
         touching = touch.pressed | (self._touching & touch.close)

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.core.frames import HOME, Vector, local_to_geodetic
+from airl_mav.core import constants, frames
 from airl_mav.profiles.vehicle import Sensors
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record, new_aircraft, new_sample
 from firmware_sim.engine.ticks import sense_record
@@ -29,7 +28,7 @@ class Rate:
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self.period_us = US_PER_S / rate_hz
+        self.period_us = constants.US_PER_S / rate_hz
         """Time between two samples [µs]."""
         self.next_us = 0.0
         """Simulated time of the next sample [µs]."""
@@ -40,11 +39,11 @@ class Rate:
         """Return True once per elapsed period."""
         if time_us < self.next_us:
             return False
-        period = int(time_us * self._rate_hz / US_PER_S)
+        period = int(time_us * self._rate_hz / constants.US_PER_S)
         # Rounding may assign a time on a boundary to the period before.
-        if (period + 1) * US_PER_S / self._rate_hz <= time_us:
+        if (period + 1) * constants.US_PER_S / self._rate_hz <= time_us:
             period += 1
-        self.period, self.next_us = period, (period + 1) * US_PER_S / self._rate_hz
+        self.period, self.next_us = period, (period + 1) * constants.US_PER_S / self._rate_hz
         return True
 
 
@@ -74,15 +73,15 @@ class SimulatedSensor:
         self._rows = np.zeros((0, self.noises))
         self._next = 0
 
-    def white(self) -> Vector:
+    def white(self) -> frames.Vector:
         """Return new white noise (noises,), standard deviation 1."""
         if self._next == len(self._rows):
             self._rows, self._next = self.site.rng.standard_normal((BLOCK, self.noises)), 0
-        row: Vector = self._rows[self._next]
+        row: frames.Vector = self._rows[self._next]
         self._next += 1
         return row
 
-    def sense(self, time_us: int, row: Vector, elapsed_us: int) -> Any:
+    def sense(self, time_us: int, row: frames.Vector, elapsed_us: int) -> Any:
         """Return the reading that is delivered after a tick at `time_us`; None = none.
 
         `row` (16,) is the motion of the vehicle (`engine.dynamics`), `elapsed_us` the time since
@@ -90,7 +89,7 @@ class SimulatedSensor:
         """
         return self.read(row, elapsed_us) if self.rate.due(time_us) else None
 
-    def read(self, row: Vector, elapsed_us: int) -> Any:
+    def read(self, row: frames.Vector, elapsed_us: int) -> Any:
         """Return a reading in motion (16,), `elapsed_us` [µs] after the obstacles started."""
         raise NotImplementedError
 
@@ -106,7 +105,7 @@ class SensorSuite:
         self,
         profile: Sensors,
         rng: np.random.Generator,
-        tick_s: float = TICK_S,
+        tick_s: float = constants.TICK_S,
         times: float = 1.0,
         record: Record | None = None,
     ) -> None:
@@ -128,7 +127,7 @@ class SensorSuite:
         # Random walk: steps grow with the square root of the tick.
         walk = math.sqrt(tick_s)
         # The profile gives the noise at the base tick; the noise density is constant.
-        white = math.sqrt(TICK_S / tick_s)
+        white = math.sqrt(constants.TICK_S / tick_s)
         record["imu_sigma"] = times * np.repeat(
             [
                 imu.accel_noise_m_s2 * white,
@@ -174,7 +173,7 @@ class SensorSuite:
             if used[i] >= len(self.noise[i]):
                 self.noise[i], used[i] = rng.standard_normal((BLOCK, _WIDTHS[i])), 0
 
-    def sample(self, time_us: int, row: Vector, battery: BatterySample) -> SensorSample:
+    def sample(self, time_us: int, row: frames.Vector, battery: BatterySample) -> SensorSample:
         """Return the sample at `time_us` [µs] in motion `row` (16,), see `engine.dynamics`."""
         record = self._record
         record["time_us"], record["motion"] = time_us, row
@@ -188,7 +187,7 @@ class SensorSuite:
         fix = None
         if measured & GPS:
             fix = GpsFix(
-                local_to_geodetic(fields["gps_position"], HOME),
+                frames.local_to_geodetic(fields["gps_position"], frames.HOME),
                 fields["gps_velocity"].copy(),
                 eph_m=gps.horizontal_noise_m,
                 epv_m=gps.vertical_noise_m,

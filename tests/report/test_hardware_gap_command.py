@@ -318,7 +318,7 @@ def test_everything_fits_into_80_columns(whole: tuple[Path, str]) -> None:
 
 
 def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
-    gap = load_comparison(whole[0], "gap")
+    gap = load_comparison(whole[0], "hardware-gap")
     (arena,) = gap.groups
     table = runs_table(gap, arena)
     column = [column.title for column in table.columns].index("flight time\n[s]")
@@ -348,7 +348,7 @@ def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
 
 def test_the_file_is_the_whole_comparison(whole: tuple[Path, str], tmp_path: Path) -> None:
     """Compare the loaded file with a rebuild from the runs; saving it again is byte-identical."""
-    read = load_comparison(whole[0], "gap")
+    read = load_comparison(whole[0], "hardware-gap")
     assert read == rebuild_comparison(whole[0])[0]
     save_comparison(read, tmp_path)
     assert (tmp_path / HARDWARE_GAP_FILE).read_bytes() == (
@@ -678,8 +678,8 @@ def test_a_card_with_a_wrong_delay_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_gap_without_its_target_says_nothing(whole: tuple[Path, str]) -> None:
-    entries = [run.entry for run in load_comparison(whole[0], "gap").runs][:1]
-    gap, runs = build_comparison(whole[0], "gap", {}, entries)
+    entries = [run.entry for run in load_comparison(whole[0], "hardware-gap").runs][:1]
+    gap, runs = build_comparison(whole[0], "hardware-gap", {}, entries)
     assert gap.contrasts == ()
     assert gap.answers == ()
     verdict = show.judge_comparison(gap, runs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,9 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core import fields, progress
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
-from airl_mav.core.fields import ProfileModel
-from airl_mav.core.progress import new_console
-from airl_mav.envs import fleet, stopping
-from airl_mav.envs.fleet_step import advance
+from airl_mav.envs import fleet, fleet_step, stopping
 from airl_mav.flight.energy import level_powers_w
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import CORNERS, Payload, VehicleProfile, equipped
@@ -154,16 +152,16 @@ def _step_figures(constants: fleet.FleetConstants) -> dict[str, StepFigures]:
     rows = np.empty((samples, n))
     ticks = np.full(n, SAMPLE_TICKS, np.int64)
     for k in range(samples):
-        advance(flown, arenas, ticks, constants, stopping.RULES, None)
+        fleet_step.advance(flown, arenas, ticks, constants, stopping.RULES, None)
         rows[k] = flown.velocity[0, 0], flown.velocity[1, 2], flown.omega[2, 2]
-    times = TICK_S * SAMPLE_TICKS * np.arange(1, samples + 1)
+    times = TICK_S * SAMPLE_TICKS * np.arange(1.0, samples + 1.0)
     return {
         name: _response(times, rows[:, i] / value)
         for i, (name, (_, value)) in enumerate(STEPS.items())
     }
 
 
-def _response(times: NDArray[np.float64], share: NDArray[np.float64]) -> StepFigures:
+def _response(times: NDArray[Any], share: NDArray[Any]) -> StepFigures:
     """Return the figures of a response (n,), as a share of the step, at times (n,) [s]."""
     reached = [np.flatnonzero(share >= level) for level in (0.1, 0.9)]
     outside = np.flatnonzero(np.abs(share - 1.0) > SETTLED)
@@ -213,7 +211,7 @@ def _warnings(profile: VehicleProfile, found: AirframeFigures) -> list[str]:
     return lines
 
 
-class VehicleOptions(ProfileModel):
+class VehicleOptions(fields.ProfileModel):
     """Show the figures of an aircraft before it flies.
 
     Step responses are those of the built-in flight controller with the profile's gains.
@@ -237,7 +235,7 @@ OPTIONS = VehicleOptions
 
 def run(options: VehicleOptions, console: Console | None = None) -> int:
     """Print the figures; return 0. Raises UsageError as `check_airframe` does."""
-    console = console or new_console()
+    console = console or progress.new_console()
     found = check_airframe(options.vehicle, options.computer, options.payload)
     document.print_facts(_facts(found), console)
     for table in (_step_table(found), _motor_table(found)):

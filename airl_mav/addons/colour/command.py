@@ -16,8 +16,7 @@ from airl_mav.addons.colour import pictures
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Motion
+from airl_mav.camera import intrinsics, render
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.constants import US_PER_S
@@ -25,10 +24,9 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import COMMON, ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress, new_console
-from airl_mav.profiles import projections
+from airl_mav.profiles import loading, projections
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
-from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load, trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
@@ -249,9 +247,9 @@ def _is_truth(options: RenderOptions, out: Path) -> bool:
     return options.show == "flow" or out.suffix.lower() == pictures.ARRAY
 
 
-def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
+def _camera(options: RenderOptions, size: tuple[int, int]) -> intrinsics.Intrinsics:
     width, height = options.width_px or size[0], options.height_px or size[1]
-    return Intrinsics.from_fov(
+    return intrinsics.Intrinsics.from_fov(
         width,
         height,
         math.radians(options.fov_deg),
@@ -272,7 +270,7 @@ def _drawn(options: RenderOptions, samples: int) -> pictures.Drawn:
 
 
 def _picture(options: RenderOptions, out: Path) -> str:
-    spec = load_profile("arenas", options.subject, ArenaSpec)
+    spec = loading.load_profile("arenas", options.subject, ArenaSpec)
     arena = generate(
         spec,
         spec.default_seed if options.seed is None else options.seed,
@@ -286,7 +284,7 @@ def _picture(options: RenderOptions, out: Path) -> str:
     attitude = quat_from_euler(0.0, pitch, yaw)
     velocity = options.speed_m_s * np.array([math.cos(yaw), math.sin(yaw), 0.0])
     rates = np.array([0.0, 0.0, math.radians(options.yaw_rate_deg_s)])
-    motion = Motion(position, attitude, velocity, rates)
+    motion = render.Motion(position, attitude, velocity, rates)
     if options.camera is not None:
         camera_of = _taking(options.camera, options.camera_name)
         pictures.write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))

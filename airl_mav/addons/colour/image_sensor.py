@@ -18,15 +18,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.colour.appearance import LUMINANCE, linear_of
-from airl_mav.addons.colour.picture import expose_colour
-from airl_mav.addons.colour.profile import AutoExposure, Imaging
+from airl_mav.addons.colour import appearance, picture, profile
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera import intrinsics, render
 from airl_mav.camera.frame import image_of, jpeg_of
-from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Motion, Mount, camera_pose, carried_on
-from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.streams import Stream, stream, words_of
+from airl_mav.core import constants, streams
 from airl_mav.profiles.camera import Camera
 
 MOST_METERED: Final = 5
@@ -51,11 +47,11 @@ class ImageFormation:
 
     def __init__(self, camera: Camera, name: str = "") -> None:
         """Prepare a camera of kind rgb or grey; `name` seeds an additional camera's noise."""
-        self._own = words_of(name)
-        self._imaging = camera.imaging or Imaging()
-        self._camera = Intrinsics.of(camera)
-        self._mount = Mount.of(camera)
-        self._period_s = camera.period_us / US_PER_S
+        self._own = streams.words_of(name)
+        self._imaging = camera.imaging or profile.Imaging()
+        self._camera = intrinsics.Intrinsics.of(camera)
+        self._mount = render.Mount.of(camera)
+        self._period_s = camera.period_us / constants.US_PER_S
         share = self._imaging.vignetting
         self._through = vignette(self._camera, share)[..., None] if share else None
         self.restart()
@@ -73,7 +69,7 @@ class ImageFormation:
         self._frame = 0
 
     def take(
-        self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int
+        self, arena: Arena, elapsed_us: int, motion: render.Motion, seed: int, frame: int
     ) -> FormedImage:
         """Return an image; `elapsed_us` is the time of its mid-exposure and middle row.
 
@@ -90,9 +86,9 @@ class ImageFormation:
         light = self._exposed(arena, elapsed_us, motion, self.gain)
         return self._formed(light, self.gain, seed, frame)
 
-    def _exposed(self, arena: Arena, elapsed_us: int, motion: Motion, gain: float) -> Light:
+    def _exposed(self, arena: Arena, elapsed_us: int, motion: render.Motion, gain: float) -> Light:
         """Return the light (h, w, channels) of all rows, each at its time in the readout."""
-        readout_us = US_PER_MS * self._imaging.readout_ms
+        readout_us = constants.US_PER_MS * self._imaging.readout_ms
         if not readout_us:
             return self._exposed_at(arena, elapsed_us, motion, 0.0, gain)
         height = self._camera.height
@@ -108,13 +104,13 @@ class ImageFormation:
         return light
 
     def _exposed_at(
-        self, arena: Arena, elapsed_us: int, motion: Motion, middle_us: float, gain: float
+        self, arena: Arena, elapsed_us: int, motion: render.Motion, middle_us: float, gain: float
     ) -> Light:
         """Return the light (h, w, channels) of an exposure centred at timestamp + `middle_us`."""
         asked = self._imaging
         count = asked.samples if asked.exposure_ms else 1
         moments_us = (
-            round(middle_us + US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5))
+            round(middle_us + constants.US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5))
             for k in range(count)
         )
         lights = (
@@ -125,20 +121,20 @@ class ImageFormation:
         return total if count == 1 else total * np.float32(1.0 / count)
 
     def _codes(
-        self, arena: Arena, elapsed_us: int, motion: Motion, since_us: int, gain: float
+        self, arena: Arena, elapsed_us: int, motion: render.Motion, since_us: int, gain: float
     ) -> NDArray[np.uint8]:
         """Return the sRGB codes (h, w, channels) at one time, `since_us` after the timestamp."""
-        position, quaternion = carried_on(motion, since_us / US_PER_S)
-        at, attitude = camera_pose(np.array(position), np.array(quaternion), self._mount)
+        position, quaternion = render.carried_on(motion, since_us / constants.US_PER_S)
+        at, attitude = render.camera_pose(np.array(position), np.array(quaternion), self._mount)
         centers = arena.centers_at(elapsed_us)
-        return expose_colour(arena, centers, self._camera, at, attitude, gain)
+        return picture.expose_colour(arena, centers, self._camera, at, attitude, gain)
 
     def _metered(
         self,
         arena: Arena,
         elapsed_us: int,
-        motion: Motion,
-        auto: AutoExposure,
+        motion: render.Motion,
+        auto: profile.AutoExposure,
         off: float,
         frame: int,
     ) -> float:
@@ -172,7 +168,7 @@ class ImageFormation:
         if asked.bayer:
             light = mosaic(light)
         if asked.full_well_e is not None:
-            rng = stream(seed, Stream.PHOTONS, frame, *self._own)
+            rng = streams.stream(seed, streams.Stream.PHOTONS, frame, *self._own)
             light = noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
         if asked.bayer:
             # The sensor saturates before the interpolation.
@@ -185,18 +181,18 @@ class ImageFormation:
         return FormedImage(image_of(jpeg, image.shape[0], image.shape[1], channels), jpeg)
 
 
-def _off_by(asked: Imaging, seed: int, own: tuple[int, ...]) -> float:
+def _off_by(asked: profile.Imaging, seed: int, own: tuple[int, ...]) -> float:
     """Return the random gain factor of an episode; `own` as in `streams.words_of`."""
     if not asked.gain_spread_ev:
         return 1.0
     # Uniform in exposure values, that is in powers of two.
-    share = 2.0 * stream(seed, Stream.EXPOSURE, *own).random() - 1.0
+    share = 2.0 * streams.stream(seed, streams.Stream.EXPOSURE, *own).random() - 1.0
     return float(2.0 ** (asked.gain_spread_ev * share))
 
 
 def _mean_light(codes: NDArray[np.uint8]) -> float:
     """Return the mean luminance of sRGB or grey codes (h, w, channels); 1 is white."""
-    weights = LUMINANCE if codes.shape[2] == 3 else np.ones(1)
+    weights = appearance.LUMINANCE if codes.shape[2] == 3 else np.ones(1)
     mean = 0.0
     for channel, weight in enumerate(weights.tolist()):
         # A histogram replaces one table look-up per pixel.
@@ -210,10 +206,10 @@ Light = NDArray[np.float32]
 
 _NUMBERS = np.arange(256, dtype=np.float64)
 
-LIGHT_OF: Final[Light] = linear_of(_NUMBERS / 255.0).astype(np.float32)
+LIGHT_OF: Final[Light] = appearance.linear_of(_NUMBERS / 255.0).astype(np.float32)
 """(256,) light of each sRGB code."""
 
-_EDGES: Final[Light] = linear_of((_NUMBERS[:-1] + 0.5) / 255.0).astype(np.float32)
+_EDGES: Final[Light] = appearance.linear_of((_NUMBERS[:-1] + 0.5) / 255.0).astype(np.float32)
 """(255,) lower bound of light for each code from 1 on, by rounding to the nearest."""
 
 
@@ -222,7 +218,7 @@ def codes_of(light: Light) -> NDArray[np.uint8]:
     return np.searchsorted(_EDGES, light, side="right").astype(np.uint8)
 
 
-def vignette(camera: Intrinsics, share: float) -> Light:
+def vignette(camera: intrinsics.Intrinsics, share: float) -> Light:
     """Return a lens's transmission (h, w).
 
     1 - share (r / R)² at a distance r from the optical axis, with R at the most distant pixel: the

@@ -20,12 +20,10 @@ from airl_mav.addons.colour import appearance
 from airl_mav.addons.colour.picture import grey
 from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.addons.colour.textures import mean_of, periods, texels
-from airl_mav.arena.geometry import Arena, Ground, PlacedMesh, Shape
-from airl_mav.arena.triangles import standing, triangles_of
+from airl_mav.arena import geometry, triangles
 from airl_mav.camera.intrinsics import Intrinsics, finer
 from airl_mav.camera.render import RANGE_M
-from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_to_matrix
+from airl_mav.core import errors, frames
 from airl_mav.vehicle.rotation import Quat, Vec
 
 Floats = NDArray[np.float64]
@@ -47,14 +45,14 @@ class PathTracer:
     def __init__(self, samples: int) -> None:
         """Set the paths per pixel; approximate off the middle of a cylinder or fisheye."""
         self._samples = samples
-        self._arena: Arena | None = None
+        self._arena: geometry.Arena | None = None
         self._centers: Floats = np.zeros((0, 3))
         self._scene: Any = None
         self._cube: tuple[Intrinsics, Cube] | None = None
 
     def __call__(
         self,
-        arena: Arena,
+        arena: geometry.Arena,
         centers: Floats,
         intrinsics: Intrinsics,
         position: Floats,
@@ -66,7 +64,7 @@ class PathTracer:
         Raises UsageError for an arena with fog, ImportError without Mitsuba (the extra `render`).
         """
         if arena.look.light.extinction > 0.0:
-            raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
+            raise errors.UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
         import mitsuba as mi
 
         mi.set_variant(VARIANT)
@@ -77,7 +75,7 @@ class PathTracer:
             integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
             bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
             self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
-        axes, k = quat_to_matrix(quaternion).T, intrinsics
+        axes, k = frames.quat_to_matrix(quaternion).T, intrinsics
         if k.model.planar:
             whole = _Film(k.width, k.height, 0, 0, k.width, k.height, k.horizontal_fov_rad)
             light = self._rendered(mi, axes, position, whole, self._samples, seed)
@@ -178,7 +176,7 @@ def _lights(mi: Any, light: appearance.Light) -> dict[str, Any]:
     return lights
 
 
-def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
+def _bodies(mi: Any, arena: geometry.Arena, centers: Floats) -> dict[str, Any]:
     b, finish, o = arena.bounds, arena.look.finish, arena.obstacles
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     half_n, half_e, half_h = b.north_max - north, b.east_max - east, 0.5 * b.height
@@ -205,9 +203,9 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
         if arena.mesh_of(i) is not None:
             continue
         row, half, at = appearance.OBSTACLE + i, o.half_size[i], centers[i]
-        if o.shape[i] == Shape.BOX:
+        if o.shape[i] == geometry.Shape.BOX:
             made += _box(mi, finish, row, at, half, float(o.yaw[i]))
-        elif o.shape[i] == Shape.CYLINDER:
+        elif o.shape[i] == geometry.Shape.CYLINDER:
             made += _cylinder(mi, finish, row, at, half)
         else:
             made.append(_sphere(mi, finish, row, at, float(half[0])))
@@ -309,14 +307,14 @@ def _sphere(
     return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
 
 
-def _mesh(mi: Any, finish: appearance.Finish, row: int, placed: PlacedMesh) -> Any:
+def _mesh(mi: Any, finish: appearance.Finish, row: int, placed: geometry.PlacedMesh) -> Any:
     """Return a mesh of flat triangles. Its pattern matches `surfaces.shade_meshes`."""
-    vertices, faces = standing(placed)
-    corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
+    vertices, faces = triangles.standing(placed)
+    corners = placed.scale * triangles.triangles_of(placed.file).corners.astype(np.float64)
     return _triangles(mi, finish, row, corners, vertices[faces])
 
 
-def _hills(mi: Any, finish: appearance.Finish, ground: Ground) -> Any:
+def _hills(mi: Any, finish: appearance.Finish, ground: geometry.Ground) -> Any:
     """Return hills with the floor's pattern: across is east, along is south."""
     corners = ground.points[ground.faces]
     own = corners[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
@@ -536,7 +534,7 @@ class PathTraced:
 
     def __call__(
         self,
-        arena: Arena,
+        arena: geometry.Arena,
         centers: NDArray[np.float64],
         intrinsics: Intrinsics,
         max_range: float,  # noqa: ARG002 (colour has no limit)

@@ -25,15 +25,10 @@ from airl_mav.addons.colour.image_sensor import ImageFormation
 from airl_mav.addons.colour.picture import Picture, antialiased, grey, render_picture
 from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera import primitives
+from airl_mav.camera import intrinsics, primitives, render
 from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.primitives import OBSTACLE
-from airl_mav.camera.render import Motion, Mount, camera_pose, expose
-from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import replace_file
-from airl_mav.core.frames import quat_to_matrix
+from airl_mav.core import constants, errors, files, frames
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.report.policy_view import PolicyCamera
@@ -68,7 +63,8 @@ Pixels = NDArray[np.uint8]
 """Picture (h, w) or (h, w, 3)."""
 
 Drawn = Callable[
-    [Arena, NDArray[np.float64], Intrinsics, NDArray[np.float64], NDArray[np.float64]], Pixels
+    [Arena, NDArray[np.float64], intrinsics.Intrinsics, NDArray[np.float64], NDArray[np.float64]],
+    Pixels,
 ]
 """Renderer: arena, obstacle centres, camera, camera position and attitude -> picture."""
 
@@ -88,7 +84,7 @@ STEP_MS = 10
 def still(
     arena: Arena,
     centers: NDArray[np.float64],
-    camera: Intrinsics,
+    camera: intrinsics.Intrinsics,
     position: NDArray[np.float64],
     quaternion: NDArray[np.float64],
     show: Shown,
@@ -110,26 +106,26 @@ def moments(flight: ReplayedFlight, rate_hz: float) -> range:
     """Return the picture times [µs] of a film from the start of navigation to the end."""
     path, record = flight.path, flight.record
     begin, end = max(record.zero_us, int(path.time_us[0])), int(path.time_us[-1])
-    return range(begin, end + 1, period_ms(rate_hz) * US_PER_MS)
+    return range(begin, end + 1, period_ms(rate_hz) * constants.US_PER_MS)
 
 
 def _replayed(
     flight: ReplayedFlight, moments: Iterable[int]
-) -> Iterator[tuple[Arena, int, Motion]]:
+) -> Iterator[tuple[Arena, int, render.Motion]]:
     """Yield arena, time since the start and the vehicle's motion; UsageError without the arena."""
     if flight.arena is None:
-        raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
+        raise errors.UsageError(f"flight {flight.label}: its arena cannot be made any more")
     for time_us in moments:
         yield flight.arena, time_us - flight.record.started_us, recorded_motion(flight, time_us)
 
 
 def film(
-    flight: ReplayedFlight, camera: Intrinsics, drawn: Drawn, moments: Iterable[int]
+    flight: ReplayedFlight, camera: intrinsics.Intrinsics, drawn: Drawn, moments: Iterable[int]
 ) -> Iterator[Pixels]:
     """Yield pictures at the vehicle's camera pose; raise UsageError without the arena."""
     mount = PolicyCamera.of(flight.vehicle.camera).mount
     for arena, elapsed_us, motion in _replayed(flight, moments):
-        at, attitude = camera_pose(motion.position, motion.quaternion, mount)
+        at, attitude = render.camera_pose(motion.position, motion.quaternion, mount)
         yield drawn(arena, arena.centers_at(elapsed_us), camera, np.array(at), np.array(attitude))
 
 
@@ -142,7 +138,7 @@ def write_png(path: Path, pixels: Pixels) -> None:
     """Write a picture. Raises OSError."""
     written = io.BytesIO()
     Image.fromarray(pixels).save(written, "PNG")
-    replace_file(path, written.getvalue())
+    files.replace_file(path, written.getvalue())
 
 
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
@@ -154,7 +150,7 @@ def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
         written, count = _video(pictures, period_ms(rate_hz))
     else:
         written, count = _animation(path.suffix[1:].upper(), pictures, period_ms(rate_hz))
-    replace_file(path, written)
+    files.replace_file(path, written)
     return count
 
 
@@ -172,7 +168,7 @@ def _video(pictures: Iterator[Pixels], each_ms: int) -> tuple[bytes, int]:
     first = next(pictures)
     height, width = first.shape[:2]
     if height % 2 or width % 2:
-        raise UsageError(f"{width} x {height} px: accepted: even numbers in an {VIDEO}")
+        raise errors.UsageError(f"{width} x {height} px: accepted: even numbers in an {VIDEO}")
     written, count = io.BytesIO(), 0
     with av.open(written, "w", format="mp4") as container:
         stream: Any = container.add_stream("libx264", Fraction(1000, each_ms))
@@ -195,20 +191,20 @@ class TakingCamera:
 
     def __init__(self, camera: Camera, name: str = "") -> None:
         """Prepare a profile's camera at its mount; `name` identifies an additional camera."""
-        self._camera, self._intrinsics = camera, Intrinsics.of(camera)
+        self._camera, self._intrinsics = camera, intrinsics.Intrinsics.of(camera)
         self._forming = None if camera.imaging is None else ImageFormation(camera, name)
-        self._mount = Mount.of(camera)
+        self._mount = render.Mount.of(camera)
 
-    def __call__(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int) -> Pixels:
+    def __call__(self, arena: Arena, elapsed_us: int, motion: render.Motion, seed: int) -> Pixels:
         """Return a picture (h, w, 3), grey (h, w) or coloured depth, at a time of the episode."""
         image: NDArray[Any]
         if self._forming is not None:
             frame = elapsed_us // self._camera.period_us
             image = self._forming.take(arena, elapsed_us, motion, seed, frame).image
         else:
-            at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
+            at, attitude = render.camera_pose(motion.position, motion.quaternion, self._mount)
             range_m, centers = self._camera.range_m, arena.centers_at(elapsed_us)
-            image = expose(arena, centers, self._intrinsics, range_m, at, attitude)
+            image = render.expose(arena, centers, self._intrinsics, range_m, at, attitude)
         if self._camera.kind == "depth":
             return coloured(image, self._camera.range_m)
         return image if self._camera.kind == "rgb" else image[..., 0]
@@ -222,22 +218,22 @@ def taken_film(
         yield camera(arena, elapsed_us, motion, flight.record.seed)
 
 
-def recorded_motion(flight: ReplayedFlight, time_us: int) -> Motion:
+def recorded_motion(flight: ReplayedFlight, time_us: int) -> render.Motion:
     """Return the motion of a recorded flight's vehicle at a time [µs]."""
     position, velocity, quaternion = pose_at(flight.path, time_us)
-    return Motion(position, quaternion, velocity, _rates(flight, time_us))
+    return render.Motion(position, quaternion, velocity, _rates(flight, time_us))
 
 
 def _rates(flight: ReplayedFlight, time_us: int) -> NDArray[np.float64]:
     """Return the angular velocity FRD (3,) [rad/s] of a recorded flight from its attitudes."""
     *_, before = pose_at(flight.path, time_us - TURNED_OVER_US)
     *_, after = pose_at(flight.path, time_us + TURNED_OVER_US)
-    turn = quat_to_matrix(before).T @ quat_to_matrix(after)
+    turn = frames.quat_to_matrix(before).T @ frames.quat_to_matrix(after)
     # For a small rotation, the skew part of its matrix is the rotation vector.
     skew = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
     )
-    rates: NDArray[np.float64] = skew * (US_PER_S / (2.0 * TURNED_OVER_US))
+    rates: NDArray[np.float64] = skew * (constants.US_PER_S / (2.0 * TURNED_OVER_US))
     return rates
 
 
@@ -249,7 +245,7 @@ TRUTHS: Final = tuple(name for name in get_args(Shown) if name not in ("rgb", "g
 
 
 def truth_of(
-    show: Shown, arena: Arena, elapsed_us: int, camera: Intrinsics, motion: Motion
+    show: Shown, arena: Arena, elapsed_us: int, camera: intrinsics.Intrinsics, motion: render.Motion
 ) -> NDArray[Any]:
     """Return the ground truth of each pixel at a time after the episode's start [µs].
 
@@ -268,7 +264,7 @@ def truth_of(
 
 
 def truth_film(
-    show: Shown, flight: ReplayedFlight, camera: Intrinsics, moments: Iterable[int]
+    show: Shown, flight: ReplayedFlight, camera: intrinsics.Intrinsics, moments: Iterable[int]
 ) -> Iterator[NDArray[Any]]:
     """Yield `truth_of` along a recorded flight for a camera at the vehicle's camera mount."""
     mount = PolicyCamera.of(flight.vehicle.camera).mount
@@ -299,7 +295,7 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array in numpy's format. Raises OSError."""
     written = io.BytesIO()
     np.save(written, array)
-    replace_file(path, written.getvalue())
+    files.replace_file(path, written.getvalue())
 
 
 Floats = NDArray[np.float64]
@@ -308,14 +304,14 @@ MOVED_OVER_US = 1_000
 """Half interval of the central difference for velocities of moving obstacles [µs]."""
 
 
-def motion_of_camera(vehicle: Motion, mount: Mount) -> Motion:
+def motion_of_camera(vehicle: render.Motion, mount: render.Mount) -> render.Motion:
     """Return the motion of a camera mounted on a vehicle; rates are about the camera's axes."""
-    at, attitude = camera_pose(vehicle.position, vehicle.quaternion, mount)
-    body = quat_to_matrix(vehicle.quaternion)
+    at, attitude = render.camera_pose(vehicle.position, vehicle.quaternion, mount)
+    body = frames.quat_to_matrix(vehicle.quaternion)
     lever = np.cross(vehicle.rates, np.array(mount.offset))
-    axes = quat_to_matrix(np.array(attitude))
+    axes = frames.quat_to_matrix(np.array(attitude))
     rates = axes.T @ body @ vehicle.rates
-    return Motion(np.array(at), np.array(attitude), vehicle.velocity + body @ lever, rates)
+    return render.Motion(np.array(at), np.array(attitude), vehicle.velocity + body @ lever, rates)
 
 
 def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
@@ -323,16 +319,16 @@ def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
     before, after = (
         arena.centers_at(elapsed_us + step) for step in (-MOVED_OVER_US, MOVED_OVER_US)
     )
-    found: Floats = (after - before) * (US_PER_S / (2.0 * MOVED_OVER_US))
+    found: Floats = (after - before) * (constants.US_PER_S / (2.0 * MOVED_OVER_US))
     return found
 
 
 def optical_flow(
-    picture: Picture, camera: Intrinsics, motion: Motion, velocities: Floats
+    picture: Picture, camera: intrinsics.Intrinsics, motion: render.Motion, velocities: Floats
 ) -> NDArray[np.float32]:
     """Return the flow (h, w, 2) of a picture [px/s]; NaN outside a fisheye's field of view."""
     rays = camera.rays
-    axes = quat_to_matrix(motion.quaternion)
+    axes = frames.quat_to_matrix(motion.quaternion)
     depth = picture.depth_m.astype(np.float64)
     # Depth 0 is infinitely distant. Such points only turn, for which any depth will do.
     far = depth <= 0.0

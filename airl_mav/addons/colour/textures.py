@@ -14,8 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.colour.appearance import TEXTURES, Finish, image_number, linear_of
-from airl_mav.addons.colour.profile import MOST_IMAGES, ImageFile
+from airl_mav.addons.colour import appearance, profile
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.loading import read_checked
 
@@ -29,8 +28,8 @@ MODES: Final = ("1", "L", "P", "RGB")
 LEAST_PX, MOST_PX = 2, 4096
 
 
-@lru_cache(maxsize=2 * MOST_IMAGES)
-def texels_of(file: ImageFile, side: int) -> Floats:
+@lru_cache(maxsize=2 * profile.MOST_IMAGES)
+def texels_of(file: profile.ImageFile, side: int) -> Floats:
     """Return a picture (side, side, 3) in linear RGB 0..1, resized; cached. Raises UsageError."""
     # Imported here because flights without a simulation read no pictures.
     from PIL import Image
@@ -45,7 +44,7 @@ def texels_of(file: ImageFile, side: int) -> Floats:
     except Exception as error:  # Decoders raise many types for damaged files.
         words = " ".join(str(error).split()) or type(error).__name__
         raise UsageError(f"{file.file}: no PNG or JPEG that can be read: {words[:200]}") from None
-    light = linear_of(np.arange(256) / 255.0).astype(np.float32)[pixels]
+    light = appearance.linear_of(np.arange(256) / 255.0).astype(np.float32)[pixels]
     # Box filter to shrink a picture, bilinear to enlarge it.
     how = Image.Resampling.BOX if len(light) >= side else Image.Resampling.BILINEAR
     planes = [
@@ -91,13 +90,13 @@ _OCTAVES: Final = 3
 
 
 @lru_cache(maxsize=8)
-def atlas(images: tuple[ImageFile, ...] = ()) -> NDArray[np.float32]:
+def atlas(images: tuple[profile.ImageFile, ...] = ()) -> NDArray[np.float32]:
     """Return all levels of all patterns (patterns * STRIDE,), in the order of TEXTURES.
 
     Red, green and blue of images follow; UsageError for an unreadable one.
     """
     planes = [np.moveaxis(texels_of(image, SIDE), -1, 0) for image in images]
-    patterns = [*map(pattern, TEXTURES), *(plane for image in planes for plane in image)]
+    patterns = [*map(pattern, appearance.TEXTURES), *(plane for image in planes for plane in image)]
     made = np.zeros(len(patterns) * STRIDE, np.float32)
     for number, finest in enumerate(patterns):
         level, n = finest, SIDE
@@ -187,27 +186,27 @@ def _leaves(rng: np.random.Generator) -> Floats:
 @cache
 def means() -> Floats:
     """Return the mean of each pattern, in the order of TEXTURES."""
-    return np.array([pattern(name).mean() for name in TEXTURES])
+    return np.array([pattern(name).mean() for name in appearance.TEXTURES])
 
 
-def mean_of(finish: Finish, row: int) -> Floats | float:
+def mean_of(finish: appearance.Finish, row: int) -> Floats | float:
     """Return the mean of a surface's pattern; (3,) of an image's red, green and blue."""
     number = int(finish.texture[row])
-    if number < len(TEXTURES):
+    if number < len(appearance.TEXTURES):
         return float(means()[number])
     mean: Floats = texels(finish, row).mean(axis=(0, 1))
     return mean
 
 
-def texels(finish: Finish, row: int) -> Floats:
+def texels(finish: appearance.Finish, row: int) -> Floats:
     """Return the finest level of a surface's texture (SIDE, SIDE, 3), 0..1 each."""
     number = int(finish.texture[row])
-    if number < len(TEXTURES):
-        return np.repeat(pattern(TEXTURES[number])[..., None], 3, axis=-1)
-    return texels_of(finish.images[(number - image_number(0)) // 3], SIDE)
+    if number < len(appearance.TEXTURES):
+        return np.repeat(pattern(appearance.TEXTURES[number])[..., None], 3, axis=-1)
+    return texels_of(finish.images[(number - appearance.image_number(0)) // 3], SIDE)
 
 
-def periods(finish: Finish) -> Floats:
+def periods(finish: appearance.Finish) -> Floats:
     """Return the length of the period (m,) of every surface's pattern, in `Finish.size_m`."""
-    lengths = [PERIOD[name] for name in TEXTURES] + [1.0] * 3 * len(finish.images)
+    lengths = [PERIOD[name] for name in appearance.TEXTURES] + [1.0] * 3 * len(finish.images)
     return np.array(lengths)[finish.texture]

@@ -31,11 +31,7 @@ from airl_mav.addons.conformance.result import (
     summary,
 )
 from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
-from airl_mav.core.child_process import terminated_as_interrupted
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
-from airl_mav.core.fields import validated
+from airl_mav.core import child_process, clock, constants, errors, fields
 from airl_mav.core.progress import new_console
 from companion.link_interface import LinkError
 
@@ -64,16 +60,16 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
     """Check a vehicle and print the result; return 0 if it conforms, else 1, or 130."""
     console = console or new_console()
     if options.out is not None and not options.out.parent.is_dir():
-        raise FieldError("out", str(options.out), problem=f"no folder {options.out.parent}")
+        raise errors.FieldError("out", str(options.out), problem=f"no folder {options.out.parent}")
     if options.skip_steps and (options.steps_only or options.steps):
         other = "--steps-only" if options.steps_only else "--steps"
-        raise FieldError("skip_steps", accepted=f"without {other}")
+        raise errors.FieldError("skip_steps", accepted=f"without {other}")
     if options.steps == ():
-        raise FieldError("steps", accepted="one name or more")
+        raise errors.FieldError("steps", accepted="one name or more")
     asked = options.model_dump(include=set(ConformanceSettings.model_fields))
     if options.skip_steps:
         asked["steps"] = ()
-    with terminated_as_interrupted():
+    with child_process.terminated_as_interrupted():
         result = check_conformance(
             **asked, progress=lambda line: console.print(line_text(line), soft_wrap=True)
         )
@@ -85,8 +81,8 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
     if options.out is not None:
         result.write(options.out)
     if result.interrupted:
-        return EXIT_INTERRUPTED
-    return 0 if result.passed else EXIT_BROKEN
+        return errors.EXIT_INTERRUPTED
+    return 0 if result.passed else errors.EXIT_BROKEN
 
 
 FACE_NORTH_S = 5.0  # Time before the first step, to turn north and stop [s]
@@ -110,9 +106,9 @@ def check_conformance(
         UsageError: Invalid value or connection, port taken, no heartbeat, or unknown autopilot;
             nothing was commanded.
     """
-    asked = validated(ConformanceSettings, settings)
+    asked = fields.validated(ConformanceSettings, settings)
     asked.check()
-    transcript = Transcript(WallClock(asked.speed), progress)
+    transcript = Transcript(clock.WallClock(asked.speed), progress)
     checklist = Checklist(transcript)
     result = ConformanceResult(asked, checklist.checks, transcript.lines)
     with closing(VehicleConnection(asked.connect, asked.speed, transcript)) as vehicle:
@@ -227,9 +223,9 @@ def _bring_down(vehicle: VehicleConnection, result: ConformanceResult) -> None:
         return
     note("note", "still armed: landing")
     result.known_to_be_down = answered = False
-    stopwatch = WallClock(vehicle.speed)
+    stopwatch = clock.WallClock(vehicle.speed)
     try:
-        while stopwatch.time_us() < RESCUE_S * US_PER_S:
+        while stopwatch.time_us() < RESCUE_S * constants.US_PER_S:
             try:
                 answered = answered or not vehicle.call("action.land()", vehicle.action.land)
                 if vehicle.wait_for(lambda: not vehicle.armed, RESCUE_RETRY_S):
@@ -240,7 +236,7 @@ def _bring_down(vehicle: VehicleConnection, result: ConformanceResult) -> None:
                 # The link may recover.
                 note("note", f"{error}: trying to land")
                 answered = False
-                retry_us = stopwatch.time_us() + int(RESCUE_RETRY_S * US_PER_S)
+                retry_us = stopwatch.time_us() + int(RESCUE_RETRY_S * constants.US_PER_S)
                 stopwatch.sleep_until(retry_us)
     finally:
         if not result.known_to_be_down:

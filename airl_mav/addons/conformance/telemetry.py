@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.addons.conformance import checklist
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import MS_PER_S, US_PER_S
-from airl_mav.core.frames import wrap_pi
+from airl_mav.core import clock, constants, frames
 
 MESSAGES = (
     "ATTITUDE",
@@ -74,7 +72,7 @@ class TelemetryBuffer:
     def __init__(self, transcript: checklist.Transcript) -> None:
         self._transcript = transcript
         self._lock = threading.Lock()
-        self._wall = WallClock()
+        self._wall = clock.WallClock()
         self._latest: dict[str, Fields] = {}
         self._position: list[tuple[float, ...]] = []
         self._heading: list[tuple[float, ...]] = []
@@ -93,7 +91,7 @@ class TelemetryBuffer:
     @property
     def silence_s(self) -> float:
         """Wall time since the last message [s]."""
-        return (self._wall.time_us() - self._last_received_us) / US_PER_S
+        return (self._wall.time_us() - self._last_received_us) / constants.US_PER_S
 
     def latest(self, name: str) -> Fields | None:
         """Return the fields of the newest message of a name; None before the first."""
@@ -137,7 +135,7 @@ class TelemetryBuffer:
         return next((each for each in self.texts[since:] if part in each.text), None)
 
     def _row(self, fields: Fields, names: tuple[str, ...]) -> tuple[float, ...]:
-        boot_s = fields["time_boot_ms"] / MS_PER_S
+        boot_s = fields["time_boot_ms"] / constants.MS_PER_S
         self.boot_s = max(self.boot_s, boot_s)
         # JSON has null for NaN.
         nan = float("nan")
@@ -413,7 +411,7 @@ def measure(step: SetpointStep, motion: EstimatedMotion, sent_s: float) -> StepR
         before = heading[heading[:, 0] <= sent_s]
         if not len(before):
             raise ValueError("no heading from before the step")
-        yaw = float(wrap_pi(before[-1, 1]))
+        yaw = float(frames.wrap_pi(before[-1, 1]))
         values = velocity[:, 0] * math.cos(yaw) + velocity[:, 1] * math.sin(yaw)
     else:
         values = velocity[:, ("north", "east", "down").index(step.quantity)]

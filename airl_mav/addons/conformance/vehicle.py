@@ -29,11 +29,9 @@ from airl_mav.addons.conformance.checklist import (
     command_long,
 )
 from airl_mav.addons.conformance.telemetry import AUTOPILOT_COMPONENT, StepSetpoint, TelemetryBuffer
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import NS_PER_US, WallClock
-from airl_mav.core.constants import MS_PER_S, US_PER_S
-from airl_mav.core.errors import FieldError
-from companion.link_interface import LinkError
-from companion.mavsdk_connection import first_autopilot, open_connection
+from companion import link_interface, mavsdk_connection
 
 POLL_S = 0.02  # Polling interval of a condition [wall s]
 SILENT_S = 5.0
@@ -67,7 +65,7 @@ class VehicleConnection:
         self.unasked_hz: Mapping[str, float] = {}
         """Expected default messages [Hz]."""
         # PX4 sends STATUSTEXT only to ground stations.
-        self._mavsdk = open_connection(url, ComponentType.GROUND_STATION)
+        self._mavsdk = mavsdk_connection.open_connection(url, ComponentType.GROUND_STATION)
         self._direct: Any = None
         self.action: Any = None
         self.offboard: Any = None
@@ -77,10 +75,10 @@ class VehicleConnection:
 
     def connect(self, timeout_s: float) -> None:
         """Wait for a flight controller. Raises UsageError on timeout [wall s]."""
-        system = first_autopilot(self._mavsdk, timeout_s)
+        system = mavsdk_connection.first_autopilot(self._mavsdk, timeout_s)
         if system is None:
             heard = f"no flight controller heard in {timeout_s:g} s (connect_timeout_s)"
-            raise FieldError("connect", self.url, problem=heard)
+            raise errors.FieldError("connect", self.url, problem=heard)
         self._target = system.get_system_id()
         self._direct = MavlinkDirect(system)
         for name in telemetry.MESSAGES:
@@ -94,7 +92,7 @@ class VehicleConnection:
         if number not in AUTOPILOTS:
             known = ", ".join(f"{key} {each.title}" for key, each in AUTOPILOTS.items())
             problem = f"HEARTBEAT.autopilot = {number}; accepted: {known}"
-            raise FieldError("connect", self.url, problem=problem)
+            raise errors.FieldError("connect", self.url, problem=problem)
         self.autopilot = AUTOPILOTS[number]
         self.telemetry.mode_name = self.autopilot.mode_name
 
@@ -117,7 +115,7 @@ class VehicleConnection:
             name = str(getattr(result, "name", result))
             self.transcript.add("heard", f"{what}: {name}")
             if must_succeed:
-                raise LinkError(f"{what}: {name}") from None
+                raise link_interface.LinkError(f"{what}: {name}") from None
             return name
         return ""
 
@@ -134,7 +132,7 @@ class VehicleConnection:
             except MavlinkDirectError as error:
                 problem = f"{what}: {error.result.name.lower()}"
                 self.transcript.add("note", f"{problem}, {left} more attempts")
-        raise LinkError(problem)
+        raise link_interface.LinkError(problem)
 
     def set_mode(self, mode: tuple[int, int], note: str) -> int:
         """Request a mode, by DO_SET_MODE's parameters 2 and 3, and return the MAV_RESULT."""
@@ -163,7 +161,7 @@ class VehicleConnection:
         try:
             self._direct.send_message(self._message(name, fields))
         except MavlinkDirectError as error:
-            raise LinkError(f"{name}: {error.result.name.lower()}") from None
+            raise link_interface.LinkError(f"{name}: {error.result.name.lower()}") from None
 
     def _message(self, name: str, fields: dict[str, Any]) -> MavlinkMessage:
         target = {"target_system": self._target, "target_component": telemetry.AUTOPILOT_COMPONENT}
@@ -175,7 +173,7 @@ class VehicleConnection:
         """Wait for one polling interval. Raises LinkError when the vehicle is silent."""
         threading.Event().wait(POLL_S)
         if self.telemetry.silence_s > SILENT_S:
-            raise LinkError(f"nothing heard for {SILENT_S:g} s")
+            raise link_interface.LinkError(f"nothing heard for {SILENT_S:g} s")
 
     def wait_for(self, condition: Callable[[], Any], timeout_s: float) -> Any:
         """Wait by the vehicle's clock for a condition and return its value; LinkError if silent."""
@@ -184,8 +182,8 @@ class VehicleConnection:
             elapsed_s = self.telemetry.boot_s - start_s
             if elapsed_s >= timeout_s:
                 return value
-            if wall.time_us() / US_PER_S > SLOWEST * timeout_s / self.speed + SLACK_S:
-                raise LinkError(f"its clock advanced by only {elapsed_s:.1f} s")
+            if wall.time_us() / constants.US_PER_S > SLOWEST * timeout_s / self.speed + SLACK_S:
+                raise link_interface.LinkError(f"its clock advanced by only {elapsed_s:.1f} s")
             self.poll()
         return value
 
@@ -208,8 +206,8 @@ class VehicleConnection:
         stopwatch, start_s = WallClock(self.speed), self.clock.now()
         every = self._direct.subscribe_message("", count)  # Too costly to keep
         try:
-            stopwatch.sleep_until(int(seconds * US_PER_S))
-            elapsed_s = self.clock.now() - start_s or stopwatch.time_us() / US_PER_S
+            stopwatch.sleep_until(int(seconds * constants.US_PER_S))
+            elapsed_s = self.clock.now() - start_s or stopwatch.time_us() / constants.US_PER_S
         finally:
             self._direct.unsubscribe_message(every)
         return counts, elapsed_s
@@ -308,10 +306,10 @@ class SetpointStream:
         while not self._stop.is_set():
             try:
                 self._send()
-            except LinkError:
+            except link_interface.LinkError:
                 return  # The main thread detects the silence.
             # Missed setpoints are skipped.
-            due_us = max(due_us + int(STREAM_PERIOD_S * US_PER_S), clock.time_us())
+            due_us = max(due_us + int(STREAM_PERIOD_S * constants.US_PER_S), clock.time_us())
             clock.sleep_until(due_us, self._stop)
 
 
@@ -369,9 +367,9 @@ class VehicleClock:
         if message.message_name != self.method.name:
             return
         if self.method is Method.SYSTEM_TIME:
-            boot_s = fields["time_boot_ms"] / MS_PER_S
+            boot_s = fields["time_boot_ms"] / constants.MS_PER_S
         elif fields["tc1"] and fields["ts1"] == self._question:
-            boot_s = fields["tc1"] / (US_PER_S * NS_PER_US)
+            boot_s = fields["tc1"] / (constants.US_PER_S * NS_PER_US)
         else:
             return
         self._answer = boot_s, received_us
@@ -409,7 +407,7 @@ class VehicleClock:
             self.inexact += 1
             return newest_s
         since_us = self.wall.time_us() - found.middle_us
-        return found.boot_s + since_us * self._speed / US_PER_S
+        return found.boot_s + since_us * self._speed / constants.US_PER_S
 
     def _ask(self) -> Exchange | None:
         """Exchange once; None without an answer, or for an answer by another clock."""

@@ -12,17 +12,14 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.files import replacing
-from airl_mav.core.progress import new_console
+from airl_mav.core import errors, fields, files, progress
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.run_columns import TABLES, Columns
 
 Format = Literal["csv", "parquet", "minari", "lerobot"]
 
 
-class ExportDataOptions(ProfileModel):
+class ExportDataOptions(fields.ProfileModel):
     """Export the data of a run for analysis or learning.
 
     csv and parquet write the tables episodes, decisions, latency and trajectories. minari and
@@ -39,7 +36,7 @@ class ExportDataOptions(ProfileModel):
     out: Path | None = Field(
         default=None, description="folder of the files; default: RUN/data-FORMAT"
     )
-    rate_hz: float = quantity(
+    rate_hz: float = fields.quantity(
         "minari and lerobot: samples per second", "Hz", ge=1, le=250, default=10.0
     )
 
@@ -49,19 +46,19 @@ OPTIONS = ExportDataOptions
 
 def run(options: ExportDataOptions, console: Console | None = None) -> int:
     """Write the files; return 0. Raises UsageError for a damaged run or an unusable folder."""
-    console = console or new_console()
+    console = console or progress.new_console()
     if options.format != "csv":
         check_installed("data")
     loaded = load(options.run)
     out = options.out or options.run / f"data-{options.format}"
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FieldError("out", f"{out}", problem="exists already; name another folder")
+        raise errors.FieldError("out", f"{out}", problem="exists already; name another folder")
     if options.format in ("csv", "parquet"):
         out.mkdir(parents=True, exist_ok=True)
         write = _write_csv if options.format == "csv" else _write_parquet
         for name, columns_of in TABLES.items():
             path = out / f"{name}.{options.format}"
-            with replacing(path) as partial:
+            with files.replacing(path) as partial:
                 write(columns_of(loaded), partial)
             console.print(f"{name}: {path}", soft_wrap=True, highlight=False)
         return 0

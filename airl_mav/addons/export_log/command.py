@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.addons.export_log.recorded import RecordedFlight
-from airl_mav.addons.export_log.ulog_log import write_ulog
+from airl_mav.addons.export_log import recorded, ulog_log
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import TrustArenas, folder_of
@@ -119,12 +118,12 @@ def _stream(run: ReplayedRun, numbers: tuple[int, ...], port: int, console: Cons
     return 0
 
 
-def flight_of(run: ReplayedRun, index: int) -> RecordedFlight:
+def flight_of(run: ReplayedRun, index: int) -> recorded.RecordedFlight:
     """Return a flight of a run; raise UsageError if the flight or its arena is missing."""
-    return RecordedFlight(run.flight(run.record(index)), run.info)
+    return recorded.RecordedFlight(run.flight(run.record(index)), run.info)
 
 
-def write_flight(flight: RecordedFlight, run: Path, out: Path, kind: Format) -> Path:
+def write_flight(flight: recorded.RecordedFlight, run: Path, out: Path, kind: Format) -> Path:
     """Write a flight to a folder and return the file's path; a recorded ULog is copied."""
     name = f"flight-{flight.replayed.record.index:03d}"
     if kind == "mcap":
@@ -136,7 +135,7 @@ def write_flight(flight: RecordedFlight, run: Path, out: Path, kind: Format) -> 
         return path
     path, own = out / f"{name}{ULOG_SUFFIX}", run / f"{name}{ULOG_SUFFIX}"
     if not own.exists():
-        write_ulog(flight, path)
+        ulog_log.write_ulog(flight, path)
     elif not (path.exists() and path.samefile(own)):
         with replacing(path) as partial:
             shutil.copyfile(own, partial)

@@ -35,8 +35,7 @@ from airl_mav.addons.export_log.scene import (
     velocity_scene,
 )
 from airl_mav.addons.recordings.recorded_flight import NAVIGATING
-from airl_mav.addons.view.replayed_flight import STANDING_M
-from airl_mav.addons.view.view_messages import OFFBOARD, VehicleShape
+from airl_mav.addons.view import replayed_flight, view_messages
 from airl_mav.black_box.mcap_file import McapFile
 from airl_mav.black_box.messages import (
     INFO,
@@ -63,8 +62,7 @@ from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.rehearsal.run_folder import info_data
-from airl_mav.report.policy_view import PolicyCamera
-from airl_mav.report.scene import FIRST, OTHER
+from airl_mav.report import policy_view, scene
 
 PAUSE_US = 2_000_000
 """Pause between repetitions of a flight [wall µs]."""
@@ -256,12 +254,12 @@ class FlightMessages:
         return Told(time_us, channel(topic, message), message.encode())
 
     @cached_property
-    def _shape(self) -> VehicleShape:
-        return VehicleShape.of(self._replayed.vehicle)
+    def _shape(self) -> view_messages.VehicleShape:
+        return view_messages.VehicleShape.of(self._replayed.vehicle)
 
     @cached_property
-    def _camera(self) -> PolicyCamera:
-        return PolicyCamera.of(self._replayed.vehicle.camera)
+    def _camera(self) -> policy_view.PolicyCamera:
+        return policy_view.PolicyCamera.of(self._replayed.vehicle.camera)
 
     # --- 3D scene
 
@@ -279,7 +277,7 @@ class FlightMessages:
             yield self._drawn(time_us, "/camera/calibration", self._calibration(time_us))
 
     def _vehicle(self, frame: str, time_us: int) -> messages.SceneUpdate:
-        look = FIRST if frame == VEHICLE else OTHER
+        look = scene.FIRST if frame == VEHICLE else scene.OTHER
         return vehicle_scene(self._shape, frame, look, timestamp(self._unix_us(time_us)))
 
     def _moving(self) -> Iterator[Told]:
@@ -378,13 +376,13 @@ class FlightMessages:
         for i in range(0, len(self._path), SAMPLES_A_STATUS):
             time_us = int(self._path.time_us[i])
             navigates = self._record.navigates(time_us)
-            flies = navigates or -float(self._path.position[i, 2]) > STANDING_M
+            flies = navigates or -float(self._path.position[i, 2]) > replayed_flight.STANDING_M
             battery = (
                 (None, None, None)
                 if charge is None
                 else (charge.voltage_v[i], charge.current_a[i], charge.remaining[i])
             )
-            mode = OFFBOARD if navigates else ""
+            mode = view_messages.OFFBOARD if navigates else ""
             yield self._ours(time_us, Status(time_us, flies, navigates, mode, *battery))
 
     def _commands(self, times_us: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from airl_mav.addons.view.replayed_flight import ReplayedFlight
 from airl_mav.black_box.messages import Decision
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import goal_distance_m
+from airl_mav.core import constants, frames
 from airl_mav.flight.trajectory import Trajectory, estimate_of, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, SETPOINTS, STAMPS, setpoint_column
 from airl_mav.rehearsal.run_folder import RunInfo
@@ -76,7 +75,7 @@ def charge_of(flight: RecordedFlight) -> Charge | None:
     left = float(flight.info.config.get("battery_charge") or 1.0)
     first = left
     rows = np.zeros((len(path), 4))
-    steps_s = np.diff(path.time_us, prepend=path.time_us[:1]) / US_PER_S
+    steps_s = np.diff(path.time_us, prepend=path.time_us[:1]) / constants.US_PER_S
     loads_w = path.power_w + flight.info.setup.computer_watts
     for i, (step_s, load_w) in enumerate(zip(steps_s.tolist(), loads_w.tolist(), strict=True)):
         rest_v = open_circuit(left, empty_v, full_v)
@@ -103,7 +102,7 @@ def decision_messages(flight: RecordedFlight) -> list[Decision]:
                 position=tuple(position.tolist()),
                 velocity=tuple(velocity.tolist()),
                 quaternion=tuple(quaternion.tolist()),
-                goal_away_m=goal_distance_m(goal, position),
+                goal_away_m=frames.goal_distance_m(goal, position),
                 setpoint=tuple(setpoints[i].astype(float).tolist()),
             )
         )

@@ -17,9 +17,7 @@ from airl_mav.addons.view.view_messages import VehicleShape
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.black_box.messages import Channel
-from airl_mav.core import frames
-from airl_mav.core.clock import NS_PER_US
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core import clock, constants, frames
 from airl_mav.core.frames import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.report import scene
@@ -50,8 +48,8 @@ def channel(topic: str, message: Any) -> Channel:
 
 def timestamp(unix_us: int) -> messages.Timestamp:
     """Convert a calendar time [µs since 1970]."""
-    seconds, rest_us = divmod(unix_us, US_PER_S)
-    return messages.Timestamp(seconds, rest_us * NS_PER_US)
+    seconds, rest_us = divmod(unix_us, constants.US_PER_S)
+    return messages.Timestamp(seconds, rest_us * clock.NS_PER_US)
 
 
 def vector(v: Floats) -> messages.Vector3:

@@ -11,22 +11,17 @@ from rich.console import Console
 
 from airl_mav.addons.fault_matrix import matrix as fault_matrix
 from airl_mav.addons.fault_matrix.matrix import CASES, MATRIX_PHASES
-from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import EXIT_NOT_MET, FieldError
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.files import replace_file
-from airl_mav.core.machine import provenance, usable_cores
+from airl_mav.core import clock, errors, fields, files, machine
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.faults import LINKS, PROCESSES, Fault, Phase
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.document import Column, TableView, print_table
-from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, IN_WORDS, VehicleName
-from airl_mav.scenario.model import GREATEST_SEED, GREATEST_WORKERS
+from airl_mav.scenario import aircraft, model
 
 ELSEWHERE = (*LINKS, *PROCESSES, "camera")
 
 
-class FaultsOptions(ProfileModel):
+class FaultsOptions(fields.ProfileModel):
     """Fly every fault in every phase of a flight, in simulated time, and report how flights end.
 
     The command runs only the flight controller and its plant. A scripted pilot arms, climbs to 5 m,
@@ -39,25 +34,25 @@ class FaultsOptions(ProfileModel):
         airl faults --episodes 1 --phases hold
     """
 
-    faults: Annotated[tuple[Fault, ...], IN_WORDS] = Field(
+    faults: Annotated[tuple[Fault, ...], aircraft.IN_WORDS] = Field(
         default=(),
         description="faults in words, without a time; by default those of the catalogue",
     )
     phases: tuple[str, ...] = Field(
         default=MATRIX_PHASES, description="phases of the flight in which they begin"
     )
-    episodes: int = quantity(
+    episodes: int = fields.quantity(
         "flights with each fault in each phase", "1", ge=1, le=10_000, default=20
     )
-    seed: int = quantity(
-        "seed of the first; the others follow", "1", ge=0, le=GREATEST_SEED, default=1
+    seed: int = fields.quantity(
+        "seed of the first; the others follow", "1", ge=0, le=model.GREATEST_SEED, default=1
     )
-    vehicle: VehicleName = DEFAULT_VEHICLE
-    workers: int | None = quantity(
+    vehicle: aircraft.VehicleName = aircraft.DEFAULT_VEHICLE
+    workers: int | None = fields.quantity(
         "processes that fly; by default one for each core",
         "1",
         ge=1,
-        le=GREATEST_WORKERS,
+        le=model.GREATEST_WORKERS,
         default=None,
     )
     out: Path | None = Field(
@@ -76,13 +71,13 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     phases = tuple(_phase(name) for name in options.phases)
     faults = [_without_time(fault) for fault in options.faults] or [c.fault for c in CASES]
     seeds = range(options.seed, options.seed + options.episodes)
-    workers = options.workers or usable_cores()
+    workers = options.workers or machine.usable_cores()
     vehicle = load_vehicle(options.vehicle)
-    out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-faults"
+    out = options.out or Path("runs") / f"{clock.utc_now():%Y%m%dT%H%M%SZ}-faults"
     out.mkdir(parents=True, exist_ok=True)
     file = out / "faults.json"
     matrix = fault_matrix.resumed(
-        file, provenance("airl faults"), fault_matrix.vehicle_digest(vehicle)
+        file, machine.provenance("airl faults"), fault_matrix.vehicle_digest(vehicle)
     )
     done: list[fault_matrix.MatrixCell] = []
     with RichProgress(console) as progress:
@@ -97,10 +92,10 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
             vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
         )
         bar.close()
-    replace_file(out / "faults.md", fault_matrix.markdown(cells).encode())
+    files.replace_file(out / "faults.md", fault_matrix.markdown(cells).encode())
     print_table(table_of(faults, phases, cells), console, wrap=True)
     console.print(f"{out}", soft_wrap=True)
-    return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
+    return errors.EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
 
 
 def table_of(
@@ -121,12 +116,12 @@ def _phase(name: str) -> Phase:
         if phase == name and phase in MATRIX_PHASES:
             known: Phase = phase
             return known
-    raise FieldError("phases", name, ", ".join(MATRIX_PHASES))
+    raise errors.FieldError("phases", name, ", ".join(MATRIX_PHASES))
 
 
 def _without_time(fault: Fault) -> str:
     if fault.phase is not None or fault.at_s:
-        raise FieldError("faults", str(fault), "without a time: each phase gives it one")
+        raise errors.FieldError("faults", str(fault), "without a time: each phase gives it one")
     if fault.part in ELSEWHERE:
-        raise FieldError("faults", str(fault), "a part of the aircraft: it flies alone here")
+        raise errors.FieldError("faults", str(fault), "a part of the aircraft: it flies alone here")
     return str(fault)

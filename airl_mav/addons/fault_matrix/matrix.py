@@ -17,19 +17,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import TypeAdapter
 
-from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import read_json, write_json
-from airl_mav.core.frames import local_to_geodetic
+from airl_mav.core import clock, constants, errors, files, frames
 from airl_mav.faults import Fault, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.addons.missions.items import NavCommand, PlanFrame
+from firmware_sim.autopilot import autopilot_state, commander, flight_modes
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Result, Setpoint
-from firmware_sim.autopilot.commander import FlightPhase as Commander
-from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
 from firmware_sim.simulation import TOUCHDOWN_M_S, EpisodeSetup, Simulation, builtin_autopilot
 
@@ -162,7 +156,7 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
     if (origin := vehicle.told_origin) is not None:
         autopilot.set_origin(origin)
     simulation = Simulation(
-        setup, start_us=0, clock=SimClock(), recording=False, autopilot=autopilot
+        setup, start_us=0, clock=clock.SimClock(), recording=False, autopilot=autopilot
     )
     try:
         return _Flight(simulation, autopilot, fault, phase, seed).fly()
@@ -200,7 +194,7 @@ class _Flight:
     def fly(self) -> FaultFlight:
         simulation = self.simulation
         pilot, end = self._pilot(), None
-        while end is None and simulation.time_us < LONGEST_S * US_PER_S:
+        while end is None and simulation.time_us < LONGEST_S * constants.US_PER_S:
             try:
                 end = next(pilot, None) or self._tick()
             # A numerical failure of the flight controller is a result, not an error of the study.
@@ -216,10 +210,10 @@ class _Flight:
         """Fly a tick; return the end if the flight is over, otherwise None."""
         simulation, flight = self.simulation, self.autopilot.flight
         # 20 Hz, as MAVSDK repeats setpoints.
-        if self.streams and simulation.time_us % _REPEAT_US < TICK_US:
+        if self.streams and simulation.time_us % _REPEAT_US < constants.TICK_US:
             self._offer()
         # Read before the tick: a hard touchdown may be detected as landed within it.
-        flown = flight.phase is Commander.AIR
+        flown = flight.phase is commander.FlightPhase.AIR
         simulation.tick()
         self.ticks += 1
         # Checked rarely, to save time: non-finite values do not disappear again.
@@ -244,7 +238,7 @@ class _Flight:
     def _offer(self) -> None:
         """Send an offboard setpoint to the north."""
         north = np.array([2.0, 0.0, 0.0])
-        setpoint = Setpoint(np.full(3, math.nan), north, 0.0, math.nan)
+        setpoint = autopilot_state.Setpoint(np.full(3, math.nan), north, 0.0, math.nan)
         self.autopilot.offer_setpoint(setpoint, self.simulation.time_us)
 
     def _waypoint(self) -> PlanItem:
@@ -252,7 +246,7 @@ class _Flight:
         origin = self.autopilot.estimator.origin
         if origin is None:
             raise ValueError("a mission without a position")
-        place = local_to_geodetic(np.array([FENCE_M, 0.0, 0.0]), origin)
+        place = frames.local_to_geodetic(np.array([FENCE_M, 0.0, 0.0]), origin)
         return PlanItem(
             NavCommand.WAYPOINT,
             PlanFrame.GLOBAL_RELATIVE_ALT_INT,
@@ -266,25 +260,25 @@ class _Flight:
         """Act as the pilot, one tick per step; yield the end when it is known."""
         autopilot = self.autopilot
         # A fault on the ground may prevent the estimator's start.
-        while autopilot.flight.phase is Commander.BOOT:
-            if self.simulation.time_us > 20 * US_PER_S:
+        while autopilot.flight.phase is commander.FlightPhase.BOOT:
+            if self.simulation.time_us > 20 * constants.US_PER_S:
                 yield "not armed"
             yield None
         yield from self._wait(2.0)
         # Checks such as a stable heading need some seconds: a pilot tries again.
         for _ in range(5):
-            if autopilot.arm(force=False) is Result.ACCEPTED:
+            if autopilot.arm(force=False) is autopilot_state.Result.ACCEPTED:
                 break
             yield from self._wait(1.0)
         else:
             yield "not armed"
         autopilot.takeoff(ALTITUDE_M)
-        yield from self._fly_as(Mode.TAKEOFF, 30.0, until=Mode.HOLD)
-        yield from self._fly_as(Mode.HOLD, 2.0)
-        north = Mode.MISSION if self.phase == "mission" else Mode.OFFBOARD
+        yield from self._fly_as(flight_modes.Mode.TAKEOFF, 30.0, until=flight_modes.Mode.HOLD)
+        yield from self._fly_as(flight_modes.Mode.HOLD, 2.0)
+        north = flight_modes.Mode.MISSION if self.phase == "mission" else flight_modes.Mode.OFFBOARD
         # After a failsafe the flight controller keeps the vehicle.
-        if autopilot.flight.mode is Mode.HOLD:
-            if north is Mode.MISSION:
+        if autopilot.flight.mode is flight_modes.Mode.HOLD:
+            if north is flight_modes.Mode.MISSION:
                 autopilot.plans.store(MissionType.MISSION, (self._waypoint(),), 1, 0)
             else:
                 self.streams = True
@@ -294,21 +288,21 @@ class _Flight:
         yield from self._fly_as(north, 3.0)
         self.streams = False
         if autopilot.flight.mode is north:
-            autopilot.set_mode(Mode.LAND)
+            autopilot.set_mode(flight_modes.Mode.LAND)
         else:
             # A failsafe has taken over: the pilot watches, then commands a landing.
             yield from self._until_down(OPERATOR_S)
-            autopilot.set_mode(Mode.LAND)
+            autopilot.set_mode(flight_modes.Mode.LAND)
         yield from self._until_down(LONGEST_S)
 
     def _fly_as(
-        self, mode: Mode, limit_s: float, until: Mode | None = None
+        self, mode: flight_modes.Mode, limit_s: float, until: flight_modes.Mode | None = None
     ) -> Iterator[End | None]:
         """Wait while a mode is active, at most `limit_s` [s]."""
-        end_us = self.simulation.time_us + limit_s * US_PER_S
+        end_us = self.simulation.time_us + limit_s * constants.US_PER_S
         flight = self.autopilot
         while flight.flight.mode is mode and self.simulation.time_us < end_us:
-            if flight.flight.phase < Commander.GROUND:
+            if flight.flight.phase < commander.FlightPhase.GROUND:
                 yield "landed"
             yield None
         if until is not None and flight.flight.mode is mode:
@@ -316,15 +310,15 @@ class _Flight:
 
     def _until_down(self, limit_s: float) -> Iterator[End | None]:
         """Wait until the motors are off, at most `limit_s` [s]."""
-        end_us = self.simulation.time_us + limit_s * US_PER_S
+        end_us = self.simulation.time_us + limit_s * constants.US_PER_S
         while self.simulation.time_us < end_us:
-            if self.autopilot.flight.phase < Commander.GROUND:
+            if self.autopilot.flight.phase < commander.FlightPhase.GROUND:
                 # Motors off above the ground: the vehicle falls.
                 yield "landed" if self.simulation.plant.position[2] > -0.5 else "crashed"
             yield None
 
     def _wait(self, seconds: float) -> Iterator[None]:
-        for _ in range(round(seconds * US_PER_S / TICK_US)):
+        for _ in range(round(seconds * constants.US_PER_S / constants.TICK_US)):
             yield None
 
 
@@ -446,17 +440,17 @@ def save(matrix: Matrix, path: Path) -> None:
     """Write every flight of a matrix as JSON, atomically."""
     flights = [asdict(flight) for cell in matrix.cells for flight in cell.flights]
     head = {"schema": SCHEMA, "made": matrix.made, "vehicle": matrix.vehicle}
-    write_json(path, {**head, "flights": flights})
+    files.write_json(path, {**head, "flights": flights})
 
 
 def load(path: Path) -> Matrix:
     """Read a matrix. Raises UsageError if it is missing or damaged."""
-    data = read_json(path, SCHEMA, "fault matrix")
+    data = files.read_json(path, SCHEMA, "fault matrix")
     try:
         flights = _FLIGHTS.validate_python(data["flights"])
         made, vehicle = dict(data["made"]), str(data["vehicle"])
     except (KeyError, TypeError, ValueError):
-        raise UsageError(
+        raise errors.UsageError(
             f"{path}: no fault matrix of this version; accepted: faults.json"
         ) from None
     cells: dict[tuple[str, Phase], list[FaultFlight]] = {}
@@ -471,9 +465,9 @@ def resumed(path: Path, made: Mapping[str, Any], vehicle: str) -> Matrix:
         return Matrix(dict(made), vehicle, ())
     found = load(path)
     if found.vehicle != vehicle:
-        raise UsageError(f"{path}: flown by another vehicle; accepted: another --out")
+        raise errors.UsageError(f"{path}: flown by another vehicle; accepted: another --out")
     if _version(found.made) != _version(made):
-        raise UsageError(f"{path}: flown by another version; accepted: another --out")
+        raise errors.UsageError(f"{path}: flown by another version; accepted: another --out")
     return found
 
 

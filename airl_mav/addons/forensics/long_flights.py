@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena
-from airl_mav.arena.placement import bounding_boxes, segments_clear
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import goal_distance_m, quats_to_euler
+from airl_mav.arena import geometry, placement
+from airl_mav.core import constants, frames
 from airl_mav.flight.episode_record import EpisodeRecord, UsualFlight, path_excess, straight_m
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
@@ -52,7 +50,7 @@ class LimitCycle:
     @property
     def time_s(self) -> float:
         """Duration [s]."""
-        return (self.end_us - self.start_us) / US_PER_S
+        return (self.end_us - self.start_us) / constants.US_PER_S
 
 
 def swinging_stretches(command: NDArray[np.floating[Any]]) -> list[NDArray[np.int64]]:
@@ -152,13 +150,13 @@ def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
 
 
 def _goal_distance(record: EpisodeRecord, part: Trajectory) -> NDArray[np.float64]:
-    return np.array([goal_distance_m(record.goal, here) for here in part.position])
+    return np.array([frames.goal_distance_m(record.goal, here) for here in part.position])
 
 
 def _approach(record: EpisodeRecord, part: Trajectory, start_us: int) -> str:
     away = _goal_distance(record, part)
     best = int(away.argmin())
-    after = (part.time_us[best] - start_us) / US_PER_S
+    after = (part.time_us[best] - start_us) / constants.US_PER_S
     return (
         f"Closest to the goal after {after:.1f} s: {away[best]:.1f} m (radius "
         f"{record.goal_radius_m:g} m, {away[0]:.1f} m at the start); {away[-1]:.1f} m at the end."
@@ -169,7 +167,7 @@ def _swinging(swing: LimitCycle | None, start_us: int) -> Cause | None:
     if swing is None or not swing.on_the_spot:
         return None
     side = "turned left and right" if swing.kind == "yaw" else "moved left and right"
-    begin = (swing.start_us - start_us) / US_PER_S
+    begin = (swing.start_us - start_us) / constants.US_PER_S
     sentence = (
         f"From {begin:.1f} s on the commands {side} {swing.turns} times in {swing.time_s:.1f} s "
         f"({swing.time_s / swing.turns:.1f} s to a side), and the vehicle stayed within "
@@ -179,7 +177,7 @@ def _swinging(swing: LimitCycle | None, start_us: int) -> Cause | None:
 
 
 def _circling(part: Trajectory) -> Cause | None:
-    heading = np.unwrap(quats_to_euler(part.quaternion)[2])
+    heading = np.unwrap(frames.quats_to_euler(part.quaternion)[2])
     turns = float(heading[-1] - heading[0]) / (2.0 * math.pi)
     if abs(turns) < CIRCLES:
         return None
@@ -188,7 +186,7 @@ def _circling(part: Trajectory) -> Cause | None:
 
 
 def _standing(part: Trajectory) -> Cause | None:
-    steps_s = np.diff(part.time_us) / US_PER_S
+    steps_s = np.diff(part.time_us) / constants.US_PER_S
     stood_s = float(steps_s[part.speed()[1:] < STILL_M_S].sum())
     share = stood_s / float(steps_s.sum())
     if share < STOOD_SHARE:
@@ -204,9 +202,9 @@ def _late_decision(
     gaps = np.diff(times)
     if len(gaps) < 3 or gaps.max() < PAUSE_PERIODS * np.median(gaps):
         return None
-    at = (times[int(gaps.argmax())] - start_us) / US_PER_S
-    usual = np.median(gaps) / US_PER_S
-    longest = gaps.max() / US_PER_S
+    at = (times[int(gaps.argmax())] - start_us) / constants.US_PER_S
+    usual = np.median(gaps) / constants.US_PER_S
+    longest = gaps.max() / constants.US_PER_S
     sentences = f"At {at:.1f} s no command came for {longest:.1f} s; usual: {usual:.2f} s."
     return Cause("a decision was late", (sentences,))
 
@@ -222,7 +220,7 @@ def _passed_goal(record: EpisodeRecord, part: Trajectory, start_us: int) -> Caus
     nearest = np.minimum.accumulate(away[first:])
     left = int(np.argmax(away[first:] > nearest + MISS_M))
     best = first + int(away[first : first + left].argmin())
-    after = (part.time_us[best] - start_us) / US_PER_S
+    after = (part.time_us[best] - start_us) / constants.US_PER_S
     return Cause(
         "passed the goal",
         (f"After {after:.1f} s it passed the goal at {away[best]:.1f} m and left again.",),
@@ -233,8 +231,8 @@ def _detour(flight: Evidence) -> Cause | None:
     excess = path_excess(flight.record)
     if flight.arena is None or excess is None or excess < DETOUR_EXCESS:
         return None
-    boxes = bounding_boxes(flight.arena.obstacles).grown(HALF_WIDTH_M)
-    free = bool(segments_clear(np.zeros(2), np.array([flight.record.goal[:2]]), boxes)[0])
+    boxes = placement.bounding_boxes(flight.arena.obstacles).grown(HALF_WIDTH_M)
+    free = bool(placement.segments_clear(np.zeros(2), np.array([flight.record.goal[:2]]), boxes)[0])
     way = f"{1.0 + excess:.2f} times the straight way"
     if free:
         return Cause("a detour without need", (f"{way}, on which nothing stood at the start.",))
@@ -263,7 +261,7 @@ def _time_limit_too_short(record: EpisodeRecord, usual: UsualFlight) -> Cause | 
 
 
 def _power(part: Trajectory) -> str:
-    time_s = (part.time_us[-1] - part.time_us[0]) / US_PER_S
+    time_s = (part.time_us[-1] - part.time_us[0]) / constants.US_PER_S
     return f"{time_s:.0f} s at {part.power_w[1:].mean():.0f} W on average emptied the battery."
 
 
@@ -282,7 +280,7 @@ class Evidence:
     """Path up to the verdict; empty if not recorded."""
     stamps: Mapping[str, NDArray[Any]]
     """Decisions by column; empty without decisions."""
-    arena: Arena | None = None
+    arena: geometry.Arena | None = None
     camera: PolicyCamera | None = None
     braking_m: Callable[[float], float] | None = None
     """Function of the vehicle's stopping distance [m] from a speed [m/s]."""

@@ -15,9 +15,7 @@ from airl_mav.addons.identification.air import Air, Thrust
 from airl_mav.addons.identification.flown import FittedQuantity
 from airl_mav.addons.identification.response import ResponseFit
 from airl_mav.black_box.mcap_file import BlackBox
-from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import validated
-from airl_mav.core.files import replace_file, write_json
+from airl_mav.core import errors, fields, files
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.computer import (
     ComputerProfile,
@@ -90,7 +88,7 @@ def identified_profile(profile: VehicleProfile, overrides: Sequence[Override]) -
     data: dict[str, Any] = profile.model_dump()
     for each in overrides:
         data[each.table] = {**(data[each.table] or {}), each.key: each.value}
-    return validated(VehicleProfile, data)
+    return fields.validated(VehicleProfile, data)
 
 
 def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Override]:
@@ -175,7 +173,7 @@ def _network(policy: str, runtime: str, box: BlackBox) -> tuple[Network, str] | 
     """Return the network of a policy and its digest; None if missing or not installed."""
     try:
         card = find_policy(policy).card
-    except UsageError:
+    except errors.UsageError:
         return None
     if card is None:
         return None
@@ -201,18 +199,18 @@ def write_identification(
 ) -> None:
     """Write the files into a new or empty folder; `identification.json`, from `data`, last."""
     out.mkdir(parents=True, exist_ok=True)
-    replace_file(out / VEHICLE_FILE, vehicle.encode())
+    files.replace_file(out / VEHICLE_FILE, vehicle.encode())
     scenario: dict[str, Any] = {"vehicle": str((out / VEHICLE_FILE).absolute())}
     if samples_ms:
         write_samples(out / LATENCY_FILE, samples_ms, ("t2 of the decisions, ms", *remarks))
         scenario["latency"] = str((out / LATENCY_FILE).absolute())
     if computer is not None:
-        replace_file(out / COMPUTER_FILE, _commented(computer, remarks).encode())
+        files.replace_file(out / COMPUTER_FILE, _commented(computer, remarks).encode())
     if data["wind"] is not None:
         scenario["wind"] = data["wind"]
     head = "".join(f"# {remark}\n" for remark in remarks)
-    replace_file(out / SCENARIO_FILE, (head + tomli_w.dumps(scenario)).encode())
-    write_json(out / IDENTIFICATION_FILE, data)
+    files.replace_file(out / SCENARIO_FILE, (head + tomli_w.dumps(scenario)).encode())
+    files.write_json(out / IDENTIFICATION_FILE, data)
 
 
 def _commented(computer: ComputerProfile, remarks: Sequence[str]) -> str:

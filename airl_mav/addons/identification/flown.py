@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap, t
 
 from airl_mav.addons.recordings.recorded_flight import NAVIGATING, path_of, stamps_of
-from airl_mav.black_box.mcap_file import BlackBox
-from airl_mav.black_box.messages import Decision, Phase
+from airl_mav.black_box import mcap_file, messages
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import PAGE, UsageError
 from airl_mav.flight.trajectory import Trajectory
@@ -67,11 +66,11 @@ class Flown:
         return time_us if self.clocks is None else time_us - self.clocks.told_us
 
 
-def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
+def flown_of(box: mcap_file.BlackBox, log: VehicleLog | None) -> Flown:
     """Return a recorded flight with its vehicle's log; UsageError without navigation."""
-    decisions = box.all_of(Decision)
+    decisions = box.all_of(messages.Decision)
     path = path_of(box)
-    begun = [each.time_us for each in box.all_of(Phase) if each.phase == NAVIGATING]
+    begun = [each.time_us for each in box.all_of(messages.Phase) if each.phase == NAVIGATING]
     if not begun or not decisions or len(path) < 2:
         raise UsageError(f"{box.path}: no decision was recorded; accepted: a flight that navigated")
     stamps = stamps_of(box)
@@ -84,7 +83,7 @@ def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
     sent_us, setpoints = stamps["sent_us"], np.asarray(stamps[SETPOINT], np.float64)
     after = [
         each.time_us
-        for each in box.all_of(Phase)
+        for each in box.all_of(messages.Phase)
         if each.time_us >= begun[0] and each.phase != NAVIGATING
     ]
     ended_us = after[0] if after else int(path.time_us[-1])

@@ -10,9 +10,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel
-from airl_mav.core.progress import new_console
+from airl_mav.core import errors, fields, progress
 from airl_mav.report.document import NONE, Column, TableView, columns_of, print_table
 
 if TYPE_CHECKING:
@@ -20,7 +18,7 @@ if TYPE_CHECKING:
     from airl_mav.addons.identification.identify import Identification
 
 
-class IdentifyOptions(ProfileModel):
+class IdentifyOptions(fields.ProfileModel):
     """Fit a vehicle, a computer and the wind to a flight recorded with --black-box.
 
     The flight controller's log (.ulg) adds mass or thrust, and the link latency. A PX4 log alone,
@@ -75,14 +73,14 @@ SHORT = {
 
 def run(options: IdentifyOptions, console: Console | None = None) -> int:
     """Identify. Returns exit status 0; raises UsageError as `identify` does."""
-    console = console or new_console()
+    console = console or progress.new_console()
     check_installed("sim", "identify")
     # Imported here: MCAP and pyulog are extras.
     from airl_mav.addons.identification.identify import identify, identify_together
 
     if len(options.flights) > 1:
         if options.ulg is not None:
-            raise FieldError("ulg", f"{options.ulg}", "nothing beside several logs")
+            raise errors.FieldError("ulg", f"{options.ulg}", "nothing beside several logs")
         found = identify_together(
             options.flights, vehicle=options.vehicle, known=options.known, out=options.out
         )

@@ -21,8 +21,7 @@ from airl_mav.addons.identification.flown import (
     block_intervals,
     seconds,
 )
-from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.frames import quats_to_euler
+from airl_mav.core import constants, frames
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import Response
 
@@ -128,9 +127,9 @@ def _rms(vectors: Array) -> float:
 
 def _driven(flown: Flown) -> _Driven:
     path, from_us = flown.path, flown.navigation_us
-    inside = (path.time_us >= from_us - US_PER_S // 2) & (path.time_us <= flown.ended_us)
+    inside = (path.time_us >= from_us - constants.US_PER_S // 2) & (path.time_us <= flown.ended_us)
     times_s = seconds(path.time_us[inside], from_us)
-    heading = np.unwrap(quats_to_euler(path.quaternion[inside])[2])
+    heading = np.unwrap(frames.quats_to_euler(path.quaternion[inside])[2])
     velocity = path.velocity[inside, :2]
     grid_s = np.arange(min(times_s[0], 0.0), times_s[-1], STEP_S)
     newest = np.searchsorted(seconds(flown.sent_us, from_us), grid_s, side="right") - 1
@@ -189,7 +188,7 @@ def _link_share(flown: Flown) -> tuple[float, float, str]:
     """Return the round trip's part outside the vehicle [s], 95 % interval and source."""
     if flown.is_logged_only:
         # A change appears in the next sample: half a sample period later on average.
-        step_s = float(np.median(np.diff(flown.sent_us))) / US_PER_S
+        step_s = float(np.median(np.diff(flown.sent_us))) / constants.US_PER_S
         changed = int(np.count_nonzero(np.any(np.diff(flown.setpoints, axis=0), axis=1)))
         unsure_s = QUANTILE * step_s / math.sqrt(12.0 * max(changed, 1))
         return (
@@ -203,10 +202,10 @@ def _link_share(flown: Flown) -> tuple[float, float, str]:
         low_us, high_us = clocks.accepted_range_us
         round_trip_us = clocks.round_trip_us or 0.0
         return (
-            round_trip_us / US_PER_S,
-            0.5 * (high_us - low_us) / US_PER_S,
+            round_trip_us / constants.US_PER_S,
+            0.5 * (high_us - low_us) / constants.US_PER_S,
             "setpoints sent and velocity in telemetry, by the flight controller's clock"
-            f" ({round_trip_us / US_PER_MS:.0f} ms of link and telemetry taken off)",
+            f" ({round_trip_us / constants.US_PER_MS:.0f} ms of link and telemetry taken off)",
         )
     return (
         TELEMETRY_AGE_S,

@@ -31,13 +31,11 @@ from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from torch.nn import functional
 
 from airl_mav.addons.imitation.planner import Planner
-from airl_mav.arena.geometry import Arena
-from airl_mav.arena.walls import Openings, openings_of
+from airl_mav.arena import geometry, walls
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
-from airl_mav.envs import sb3
+from airl_mav.envs import saved_state, sb3
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.saved_state import State
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.policy.actions import (
     VELOCITIES,
@@ -49,15 +47,14 @@ from airl_mav.policy.actions import (
 )
 from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import GreedyPolicy, GreedySettings
-from airl_mav.training.config import ExpertName
-from airl_mav.training.dqn import Ring, Shapes, shapes_of
+from airl_mav.training import config, dqn
 
 
-class Demonstrations(Ring):
+class Demonstrations(dqn.Ring):
     """Observations and the expert's actions."""
 
     def __init__(
-        self, steps: int, vehicles: int, shapes: Shapes, actions: spaces.Space[Any]
+        self, steps: int, vehicles: int, shapes: dqn.Shapes, actions: spaces.Space[Any]
     ) -> None:
         shape = () if isinstance(actions, spaces.Discrete) else actions.shape or ()
         kind = np.int64 if isinstance(actions, spaces.Discrete) else np.float32
@@ -99,7 +96,7 @@ class Imitation(BaseAlgorithm):
         policy: str,
         env: NavigationVecEnv,
         *,
-        expert: ExpertName = "planner",
+        expert: config.ExpertName = "planner",
         learning_rate: float | Schedule = 3e-4,
         batch_size: int = 256,
         buffer_size: int = 100_000,
@@ -120,7 +117,7 @@ class Imitation(BaseAlgorithm):
             support_multi_env=True,
             **arguments,
         )
-        self.expert_name: ExpertName = expert
+        self.expert_name: config.ExpertName = expert
         self.batch_size = batch_size
         self.buffer_size = buffer_size
         self.learning_starts = learning_starts
@@ -141,7 +138,7 @@ class Imitation(BaseAlgorithm):
             raise UsageError(f"algorithm.expert: none for a {type(self.env).__name__}")
         self._expert = StatefulExpert(self.expert_name, self.env.env.navigation)
         self.env.teach(self._expert)
-        shapes = shapes_of(self.observation_space)
+        shapes = dqn.shapes_of(self.observation_space)
         self.replay = Demonstrations(self.buffer_size, self.n_envs, shapes, self.action_space)
         self.generator = np.random.default_rng(self.seed)
 
@@ -283,9 +280,9 @@ class GatePilot:
         for i in slots:
             arena = self._navigation.arenas[i]
             assert arena is not None  # noqa: S101 (an episode has begun in it)
-            self._put(i, openings_of(arena), arena)
+            self._put(i, walls.openings_of(arena), arena)
 
-    def _put(self, i: int, openings: Openings, arena: Arena) -> None:
+    def _put(self, i: int, openings: walls.Openings, arena: geometry.Arena) -> None:
         room = self._middle.shape[1]
         if (more := len(openings) + 1 - room) > 0:
             pad = ((0, 0), (0, more), (0, 0))
@@ -417,7 +414,7 @@ class GreedyPilots:
 class StatefulExpert(sb3.Expert):
     """Expert and its memory, with checkpoint support."""
 
-    def __init__(self, name: ExpertName, navigation: Navigation) -> None:
+    def __init__(self, name: config.ExpertName, navigation: Navigation) -> None:
         """Create an expert by name, for the flights of a vectorized simulator."""
         self._navigation = navigation
         self._chooser: Planner | GreedyPilots | GatePilot
@@ -446,7 +443,7 @@ class StatefulExpert(sb3.Expert):
             self._sides[:] = [pilot.side for pilot in self._chooser.pilots]
         return {"begun": self._begun, "sides": self._sides}
 
-    def set_state(self, state: State) -> None:
+    def set_state(self, state: saved_state.State) -> None:
         """Restore a saved state; restore the flights first."""
         super().set_state(state)
         # The planner's maps and the gates' openings follow from the arenas, so they are not saved.

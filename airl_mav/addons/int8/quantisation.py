@@ -17,8 +17,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
-from airl_mav.experiments.gym_flier import navigation_of
-from airl_mav.experiments.hardware_gap import training_environment
+from airl_mav.experiments import gym_flier, hardware_gap
 from airl_mav.policy.actions import discrete_actions
 from airl_mav.policy.card import (
     ONNX_FILE,
@@ -164,7 +163,7 @@ def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, in
     """Return inputs of a policy on reserved seeds, its training arena, and the last seed."""
     card = load_card(folder)
     arena = card.training.arena or DEFAULT_ARENA
-    environment = training_environment(card) or {}
+    environment = hardware_gap.training_environment(card) or {}
     asked: dict[str, Any] = {"arena": arena, "seed": FIRST_SEED, "episodes": flights}
     if "vehicle" in environment:
         # The vehicle's camera fits the network.
@@ -173,7 +172,7 @@ def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, in
     loaded = scenario.fresh_policy(FIRST_SEED)
     assert isinstance(loaded, LearnedPolicy)  # noqa: S101 (it has a card)
     witness = _Witness(LearnedPilots(loaded, action_generator), loaded)
-    navigation = navigation_of(scenario, min(scenario.scenario.slots, flights))
+    navigation = gym_flier.navigation_of(scenario, min(scenario.scenario.slots, flights))
     for _ in fly_seeds(navigation, witness, list(scenario.seeds)):
         pass
     keys = witness.seen[0]

@@ -12,10 +12,8 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core import errors, fields, progress
 from airl_mav.core.files import replace_file
-from airl_mav.core.progress import new_console
 from airl_mav.profiles.arena import ASSET_NAME, SHAPES, ArenaSpec
 from airl_mav.profiles.assets import MOST_PARTS, MOST_TRIANGLES, MeshFile
 from airl_mav.profiles.loading import load_profile
@@ -27,7 +25,7 @@ if TYPE_CHECKING:
 EXTRAS = ("mesh",)
 
 
-class AssetOptions(ProfileModel):
+class AssetOptions(fields.ProfileModel):
     """Make an arena profile whose obstacles are a mesh, and boxes that cover the mesh.
 
     Cameras see the mesh; plants and planners use the boxes. The mesh is divided into cells as fine
@@ -51,8 +49,8 @@ class AssetOptions(ProfileModel):
     arena: ArenaName = Field(
         default=DEFAULT_ARENA, description="arena profile whose obstacles become the mesh"
     )
-    most: int = quantity("greatest number of boxes", "1", ge=1, le=MOST_PARTS, default=64)
-    scale: float = quantity("metres per unit of the file", "m", gt=0, le=1e6, default=1.0)
+    most: int = fields.quantity("greatest number of boxes", "1", ge=1, le=MOST_PARTS, default=64)
+    scale: float = fields.quantity("metres per unit of the file", "m", gt=0, le=1e6, default=1.0)
     up: Literal["auto", "y", "z"] = Field(
         default="auto", description="axis of the file that points up; auto: y for .glb, else z"
     )
@@ -71,9 +69,9 @@ def run(options: AssetOptions, console: Console | None = None) -> int:
     # Imported here: trimesh is an extra.
     from airl_mav.addons.meshes.mesh_boxes import boxes_of_mesh
 
-    console = console or new_console()
+    console = console or progress.new_console()
     if options.out.suffix.lower() != ".toml":
-        raise FieldError("out", f"{options.out}", "a file name that ends in .toml")
+        raise errors.FieldError("out", f"{options.out}", "a file name that ends in .toml")
     name = _name(options)
     made = boxes_of_mesh(options.mesh, most=options.most, scale=options.scale, up=options.up)
     surface = options.out.with_suffix(".npz") if options.seen == "mesh" else None
@@ -87,7 +85,7 @@ def run(options: AssetOptions, console: Console | None = None) -> int:
         for path, data in files.items():
             replace_file(path, data)
     except OSError as error:
-        raise FieldError(
+        raise errors.FieldError(
             "out", f"{options.out}", problem=f"cannot write: {error.strerror}"
         ) from None
     seen = "the boxes" if surface is None else f"its {len(made.surface):,} triangles"
@@ -104,7 +102,7 @@ def run(options: AssetOptions, console: Console | None = None) -> int:
 def _name(options: AssetOptions) -> str:
     name = options.name or options.mesh.stem.lower().replace("_", "-").replace(" ", "-")
     if name in SHAPES or ASSET_NAME.fullmatch(name) is None:
-        raise FieldError(
+        raise errors.FieldError(
             "name", name, "small letters, with dashes between words, and no name of a shape"
         )
     return name
@@ -130,7 +128,7 @@ def _files(
     if surface is None:
         return {options.out: _profile(options, name, made, None).encode()}
     if len(made.surface) > MOST_TRIANGLES:
-        raise FieldError(
+        raise errors.FieldError(
             "mesh",
             f"{options.mesh}",
             f"at most {MOST_TRIANGLES:,} triangles, not {len(made.surface):,}, unless cameras shall"

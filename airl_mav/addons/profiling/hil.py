@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from airl_mav.addons.profiling import measurement
-from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
+from airl_mav.addons.profiling import measurement, policy_under_test
 from airl_mav.core.child_process import signal_handlers
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
@@ -80,10 +79,10 @@ class DecisionLimit:
 
 
 def measure(
-    request: measurement.ProfileRequest, policy: PolicyUnderTest, bar: Bar
+    request: measurement.ProfileRequest, policy: policy_under_test.PolicyUnderTest, bar: Bar
 ) -> measurement.Recording:
     """Fly until there are enough decisions; Ctrl-C lands. Arguments as `sitl.measure`."""
-    load_us, first_us, _ = cold_start(request, policy)
+    load_us, first_us, _ = policy_under_test.cold_start(request, policy)
     interrupted, stop = threading.Event(), threading.Event()
 
     def interrupt(*_: object) -> None:
@@ -120,7 +119,7 @@ def measure(
 
 def _fly(
     request: measurement.ProfileRequest,
-    policy: PolicyUnderTest,
+    policy: policy_under_test.PolicyUnderTest,
     bar: Bar,
     stop: threading.Event,
     interrupted: threading.Event,

@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from airl_mav.addons.profiling.soak import Soak, write_soak_page
-from airl_mav.core.clock import utc_now
-from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.errors import FieldError, usage_errors
-from airl_mav.core.fields import COMMON, quantity
+from airl_mav.core import clock, constants, errors, fields
 from airl_mav.core.files import save_arrays, write_json
 from airl_mav.core.machine import MachineState, package_versions
 from airl_mav.latency.injection import duration_ms
@@ -40,9 +37,7 @@ from airl_mav.profiles.computer import (
     write_profile,
     write_samples,
 )
-from airl_mav.scenario.aircraft import Ports
-from airl_mav.scenario.model import GREATEST_SEED, Inference
-from airl_mav.scenario.stand_alone import CompanionAddresses
+from airl_mav.scenario import aircraft, model, stand_alone
 
 SCHEMA = 1
 """Version of the facts file."""
@@ -106,7 +101,7 @@ class Recording:
     def command_ages(self, hold_s: float) -> CommandAges:
         """Return the ages of the flown command, with a hold of `hold_s` [s] if not flown."""
         if self.exposure is None:
-            return ages_in_closed_loop(self.stages["t2"], round(hold_s * US_PER_S))
+            return ages_in_closed_loop(self.stages["t2"], round(hold_s * constants.US_PER_S))
         columns = self.columns
         return command_ages(columns[self.exposure], columns["sent_us"], self.flight_numbers)
 
@@ -176,7 +171,7 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
     written = workload.model_copy(update={"latency": by_file})
     title = f"t2 of {measured.card.name} on {profile.cpu}, {measured.network.runtime}, ms, in order"
     more: tuple[Path, ...] = ()
-    with usage_errors(f"--out {path.parent}"):
+    with errors.usage_errors(f"--out {path.parent}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         if measured.soak is not None:
             more = _save_soak(measured, measured.soak, path.with_name(f"{stem}.soak.npz"))
@@ -193,7 +188,7 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
     samples_ms = tuple(round(each, 3) for each in workload.latency.samples_ms or ())
     machine, soaked = measured.machine, measured.soak
     how = MeasurementConditions(
-        date_utc=utc_now().isoformat(timespec="seconds"),
+        date_utc=clock.utc_now().isoformat(timespec="seconds"),
         machine=f"{machine['os']}, {machine['architecture']}, {machine['python']}",
         state=dict(measured.before.rows()),
         soak="" if soaked is None else soaked.sentence(),
@@ -203,7 +198,7 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
     inline = LatencyDistribution(distribution="samples", samples_ms=samples_ms)
     told = workload.model_copy(update={"latency": inline, "measured": how})
     profile = measured.profile.model_copy(update={"workloads": {measured.workload: told}})
-    with usage_errors(f"--share {path}"):
+    with errors.usage_errors(f"--share {path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_profile(path, profile)
     return path
@@ -237,7 +232,7 @@ def _facts(measured: ComputerMeasurement, out: Path) -> dict[str, Any]:
         "level": request.level,
         "command": {**request.model_dump(mode="json"), "out": str(out)},
         "network": measured.network.model_dump(),
-        "date_utc": utc_now().isoformat(timespec="seconds"),
+        "date_utc": clock.utc_now().isoformat(timespec="seconds"),
         "machine": measured.machine,
         "before": asdict(measured.before),
         "after": asdict(measured.after),
@@ -261,7 +256,7 @@ SHORTEST_SOAK_MS, LONGEST_SOAK_MS = 10e3, 24 * 3600e3
 ProfileLevel = Literal["bare", "sitl", "hil"]
 
 
-class ProfileRequest(CompanionAddresses, Inference):
+class ProfileRequest(stand_alone.CompanionAddresses, model.Inference):
     """Subject and method of a measurement."""
 
     policy: str | None = Field(
@@ -269,7 +264,7 @@ class ProfileRequest(CompanionAddresses, Inference):
         description="policy to measure: a name, or a path to a folder with policy.onnx and"
         " card.json; by default the default policy, or with a network a random one",
     )
-    network: Annotated[str | None, COMMON] = Field(
+    network: Annotated[str | None, fields.COMMON] = Field(
         default=None,
         pattern=r"^[1-9]\d?x[1-9]\d{0,2}$",
         description="LAYERSxFILTERS of a randomly initialised network of the paper's template to"
@@ -281,16 +276,16 @@ class ProfileRequest(CompanionAddresses, Inference):
         pattern=r"^\d{1,4}x\d{1,4}$",
         description="with a network: WIDTHxHEIGHT of the image that is its input, px",
     )
-    level: Annotated[ProfileLevel, COMMON] = Field(
+    level: Annotated[ProfileLevel, fields.COMMON] = Field(
         default="bare",
         description="bare: inference alone, on this computer. sitl: in flight, through the"
         " processes of airl-sitl, all stages. hil: the companion on this computer, against an"
         " airl-firmware that runs elsewhere",
     )
-    decisions: Annotated[int, COMMON] = quantity(
+    decisions: Annotated[int, fields.COMMON] = fields.quantity(
         "decisions to measure, after the warm-up", "1", ge=10, le=100_000, default=1000
     )
-    warm_up: int = quantity(
+    warm_up: int = fields.quantity(
         "decisions at the start of each flight that are left out; the very first one is reported"
         " separately",
         "1",
@@ -298,7 +293,7 @@ class ProfileRequest(CompanionAddresses, Inference):
         le=10_000,
         default=50,
     )
-    hold_s: float = quantity(
+    hold_s: float = fields.quantity(
         "levels sitl and hil, t3: how long an action is held before the next observation; short,"
         " and flown at walking pace, because timing is measured and not the quality of flight",
         "s",
@@ -306,24 +301,24 @@ class ProfileRequest(CompanionAddresses, Inference):
         le=1,
         default=0.05,
     )
-    soak: Annotated[str | None, COMMON] = Field(
+    soak: Annotated[str | None, fields.COMMON] = Field(
         default=None,
         description="after the measurement, run inference alone for this time, as 90s, 10min or 1h,"
         " and record latency, frequency and temperature, to detect thermal throttling",
     )
-    on: Annotated[str | None, COMMON] = Field(
+    on: Annotated[str | None, fields.COMMON] = Field(
         default=None,
         pattern=NAME,
         description="name of the computer, and of its profile's file; by default after its"
         " processor",
     )
-    workload: Annotated[str | None, COMMON] = Field(
+    workload: Annotated[str | None, fields.COMMON] = Field(
         default=None,
         pattern=NAME,
         description="name of the workload in the profile; replaces an existing one; default: from"
         " policy, level, runtime and threads",
     )
-    watts: Annotated[float | None, COMMON] = quantity(
+    watts: Annotated[float | None, fields.COMMON] = fields.quantity(
         "power that the computer draws; by default as measured, where this computer tells it,"
         " or that of an existing profile, or 0",
         "W",
@@ -331,18 +326,18 @@ class ProfileRequest(CompanionAddresses, Inference):
         le=10_000,
         default=None,
     )
-    price_usd: float | None = quantity(
+    price_usd: float | None = fields.quantity(
         "price of the computer; by default that of an existing profile, or 0",
         "USD",
         ge=0,
         le=1_000_000,
         default=None,
     )
-    seed: int = quantity(
+    seed: int = fields.quantity(
         "seed of the random network, of the observations at level bare, and of the flights",
         "1",
         ge=0,
-        le=GREATEST_SEED,
+        le=model.GREATEST_SEED,
         default=1,
     )
     vehicle: str | None = Field(
@@ -350,7 +345,7 @@ class ProfileRequest(CompanionAddresses, Inference):
         description="vehicle profile that gives the camera: a shipped name, or a path to a .toml;"
         " by default the first shipped one whose camera fits",
     )
-    ports: Ports = Field(default_factory=Ports, description="ports of level sitl")
+    ports: aircraft.Ports = Field(default_factory=aircraft.Ports, description="ports of level sitl")
 
     @field_validator("soak")
     @classmethod
@@ -359,18 +354,18 @@ class ProfileRequest(CompanionAddresses, Inference):
             soak is not None
             and not SHORTEST_SOAK_MS <= (duration_ms(soak) or 0.0) <= LONGEST_SOAK_MS
         ):
-            raise FieldError("soak", soak, "10s to 24h, as 90s, 10min or 1h")
+            raise errors.FieldError("soak", soak, "10s to 24h, as 90s, 10min or 1h")
         return soak
 
     @property
     def soak_s(self) -> float | None:
         """Duration of the soak [s]; None: no soak."""
         given_ms = None if self.soak is None else duration_ms(self.soak)
-        return None if given_ms is None else given_ms * US_PER_MS / US_PER_S
+        return None if given_ms is None else given_ms * constants.US_PER_MS / constants.US_PER_S
 
     @property
     def flown_as(self) -> dict[str, Any]:
         """Scenario fields for the flight at levels sitl and hil."""
-        shared = {*Inference.model_fields, "hold_s", "seed"}
+        shared = {*model.Inference.model_fields, "hold_s", "seed"}
         limits = {"goal_radius_m": 0.5, "max_speed_m_s": FLOWN_SPEED_M_S}
         return {**self.model_dump(include=shared), **limits}

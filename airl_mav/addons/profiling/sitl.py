@@ -9,16 +9,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from airl_mav.addons.profiling import measurement
-from airl_mav.addons.profiling.policy_under_test import PolicyUnderTest, cold_start
+from airl_mav.addons.profiling import measurement, policy_under_test
 from airl_mav.core.child_process import terminated_as_interrupted
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
-from airl_mav.rehearsal.channel import State
+from airl_mav.rehearsal import channel, run_folder
 from airl_mav.rehearsal.observer import LiveObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
-from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 
@@ -45,7 +43,7 @@ class DecisionEstimate(LiveObserver):
         if phase == "navigating":
             self._navigating_us = time_us
 
-    def state(self, state: State, started_us: int) -> None:  # noqa: ARG002 (an Observer's names)
+    def state(self, state: channel.State, started_us: int) -> None:  # noqa: ARG002 (an Observer's names)
         """Show the estimated number of decisions."""
         if self._navigating_us is not None:
             flown = max(0, state.time_us - self._navigating_us) // self._period_us
@@ -53,11 +51,11 @@ class DecisionEstimate(LiveObserver):
 
 
 def measure(
-    request: measurement.ProfileRequest, policy: PolicyUnderTest, bar: Bar
+    request: measurement.ProfileRequest, policy: policy_under_test.PolicyUnderTest, bar: Bar
 ) -> measurement.Recording:
     """Fly until there are enough decisions; arguments as `policy_under_test.measure`."""
     # Before the network is opened elsewhere.
-    load_us, first_us, later_us = cold_start(request, policy)
+    load_us, first_us, later_us = policy_under_test.cold_start(request, policy)
     scenario = resolve(
         Scenario(
             vehicle=policy.vehicle,
@@ -120,12 +118,12 @@ def _fly(scenario: ResolvedScenario, observer: DecisionEstimate) -> measurement.
     """Fly once; return the stamps by the simulator's clock. Raises RehearsalError."""
     with TemporaryDirectory(prefix="airl-profile-") as scratch:
         path = Path(scratch) / "run"
-        folder = RunFolder.create(
+        folder = run_folder.RunFolder.create(
             path, "profile", {}, setup=scenario.setup, seeds=scenario.scenario.seeds
         )
         with Rehearsal(scenario, folder, observer) as rehearsal:
             rehearsal.run()
-        latency = load(path).latency[0]
+        latency = run_folder.load(path).latency[0]
     if "sent_us" not in latency:
         raise RehearsalError("the companion left no decisions")
     return {name: np.asarray(latency[name], np.int64) for name in COLUMNS}

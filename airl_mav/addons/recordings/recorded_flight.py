@@ -11,13 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
-from airl_mav.black_box.mcap_file import BlackBox, read_black_box
-from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
-from airl_mav.core.constants import UNMEASURED_A, US_PER_MS, US_PER_S, CommandKind
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import sha256_of, typed
-from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.core.resource_use import ProcessUse
+from airl_mav.black_box import mcap_file, messages
+from airl_mav.core import constants, errors, files, frames, resource_use
 from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory, measure_quality
@@ -44,7 +39,7 @@ class FlownPilot:
 
     hold_s: float
     goal_radius_m: float
-    commands: CommandKind = "velocity"
+    commands: constants.CommandKind = "velocity"
 
 
 @dataclass(frozen=True)
@@ -58,7 +53,7 @@ class FlownLimits:
 class FlownSettings:
     """Settings of a flight that its page requires."""
 
-    goal: Goal
+    goal: frames.Goal
     seed: int
     speed: Annotated[float, Field(gt=0.0)]
     pilot: FlownPilot
@@ -68,12 +63,12 @@ class FlownSettings:
 _SETTINGS = TypeAdapter(FlownSettings)
 
 
-def settings_of(box: BlackBox) -> FlownSettings:
+def settings_of(box: mcap_file.BlackBox) -> FlownSettings:
     """Return the flight's settings. Raises UsageError if the black box lacks them."""
-    return typed(_SETTINGS, box.run.get("config", {}), box.path)
+    return files.typed(_SETTINGS, box.run.get("config", {}), box.path)
 
 
-def info_of(box: BlackBox, digest: str = "") -> run_folder.RunInfo:
+def info_of(box: mcap_file.BlackBox, digest: str = "") -> run_folder.RunInfo:
     """Return the description of the run. Raises UsageError if the black box lacks it."""
     run = box.run
     info = run_folder.run_info(run, box.path)
@@ -81,18 +76,18 @@ def info_of(box: BlackBox, digest: str = "") -> run_folder.RunInfo:
 
 
 def episode_of(
-    box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
+    box: mcap_file.BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
 ) -> run_folder.FlownEpisode:
     """Return the flight of a black box, or raise UsageError; `path` replaces its telemetry."""
     asked = settings_of(box)
     path = path_of(box) if path is None else path
     stamps = stamps_of(box)
     started_us = int(path.time_us[0]) if len(path) else 0
-    phases = box.all_of(Phase)
+    phases = box.all_of(messages.Phase)
     begun = [phase.time_us for phase in phases if phase.phase == NAVIGATING]
     navigation_us = begun[0] if begun else None
     ended_us = _ended_us(box, path, navigation_us)
-    ends = box.all_of(End)
+    ends = box.all_of(messages.End)
     reason, notes = (ends[-1].reason, ends[-1].notes) if ends else _cut(box, ended_us)
     if box.damaged:
         notes = (*notes, "the recording is damaged: its checksum is wrong")
@@ -105,7 +100,7 @@ def episode_of(
         quality = measure_quality(
             *(path, navigation_us, ended_us, 0.0), decisions=stamps, hold_s=asked.pilot.hold_s
         )
-    batteries = [status.battery_remaining for status in box.all_of(Status)]
+    batteries = [status.battery_remaining for status in box.all_of(messages.Status)]
     record = EpisodeRecord(
         index=0,
         seed=asked.seed,
@@ -119,19 +114,19 @@ def episode_of(
         started_us=started_us,
         navigation_us=navigation_us,
         ended_us=ended_us,
-        wall_s=(ended_us - started_us) / US_PER_S / asked.speed,
+        wall_s=(ended_us - started_us) / constants.US_PER_S / asked.speed,
         slipped_us=0,
         battery_remaining=next((b for b in reversed(batteries) if b is not None), None),
         quality=quality,
         notes=(*remarks, *notes),
-        companion_use=_use(box.all_of(Resources)),
+        companion_use=_use(box.all_of(messages.Resources)),
     )
     return run_folder.FlownEpisode(record, path, stamps)
 
 
-def path_of(box: BlackBox) -> Trajectory:
+def path_of(box: mcap_file.BlackBox) -> Trajectory:
     """Return the path and power [W] of the telemetry; NaN power if never measured."""
-    told = box.all_of(Telemetry)
+    told = box.all_of(messages.Telemetry)
     rows = [(*each.position, *each.velocity, *each.quaternion) for each in told]
     states = np.array(rows, np.float64).reshape(len(rows), 10)  # None becomes NaN
     times = np.array([each.time_us for each in told], np.int64)
@@ -140,13 +135,13 @@ def path_of(box: BlackBox) -> Trajectory:
     times, states = times[known], states[known]
     later = np.diff(times, prepend=NO_STAMP) > 0
     times, states = times[later], states[later]
-    power_w = _power_w(box.all_of(Status), times)
+    power_w = _power_w(box.all_of(messages.Status), times)
     return Trajectory(times, states[:, :3], states[:, 3:6], states[:, 6:], power_w)
 
 
-def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
+def stamps_of(box: mcap_file.BlackBox) -> dict[str, NDArray[Any]]:
     """Return the columns of the decisions as in `latency.stamps.DecisionLog.columns`."""
-    decisions, commands = box.all_of(Decision), settings_of(box).pilot.commands
+    decisions, commands = box.all_of(messages.Decision), settings_of(box).pilot.commands
     columns: dict[str, NDArray[Any]] = {
         name: np.array([getattr(each, name) for each in decisions], np.int64) for name in STAMPS
     }
@@ -157,14 +152,14 @@ def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
+def _power_w(statuses: list[messages.Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the newest power (n,) at times (n,); NaN if never measured (old PX4 sends -1 A)."""
     told = [
         (status.time_us, status.voltage_v * status.current_a)
         for status in statuses
         if status.voltage_v is not None
         and status.current_a is not None
-        and status.current_a != UNMEASURED_A
+        and status.current_a != constants.UNMEASURED_A
     ]
     if not told:
         return np.full(len(times_us), np.nan)
@@ -173,19 +168,19 @@ def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.
     return np.asarray(power_w[np.maximum(newest, 0)], np.float64)
 
 
-def _ended_us(box: BlackBox, path: Trajectory, navigation_us: int | None) -> int:
+def _ended_us(box: mcap_file.BlackBox, path: Trajectory, navigation_us: int | None) -> int:
     """Return the end of navigation, or of the recording [µs]."""
     if navigation_us is not None:
-        for phase in box.all_of(Phase):
+        for phase in box.all_of(messages.Phase):
             if phase.time_us >= navigation_us and phase.phase != NAVIGATING:
                 return phase.time_us
-    sent_us = [decision.sent_us for decision in box.all_of(Decision)]
+    sent_us = [decision.sent_us for decision in box.all_of(messages.Decision)]
     return max([navigation_us or 0, *sent_us, *map(int, path.time_us[-1:])])
 
 
-def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
+def _cut(box: mcap_file.BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
     """Return the reason and the notes of a flight with a truncated recording."""
-    phases = box.all_of(Phase)
+    phases = box.all_of(messages.Phase)
     where = f" while {phases[-1].phase}" if phases else ""
     note = "the companion, its computer or the power failed, or the file was damaged there"
     return f"the recording ends{where}", (f"the recording ends at {ended_us / 1e6:.2f} s: {note}",)
@@ -198,17 +193,17 @@ def _arrived_us(
     if navigation_us is None:
         return None
     flown = path.between(navigation_us, ended_us)
-    away = np.array([goal_distance_m(asked.goal, here) for here in flown.position])
+    away = np.array([frames.goal_distance_m(asked.goal, here) for here in flown.position])
     there = np.flatnonzero(away < asked.pilot.goal_radius_m)
     return int(flown.time_us[there[0]]) if len(there) else None
 
 
-def _use(resources: list[Resources]) -> ProcessUse | None:
+def _use(resources: list[messages.Resources]) -> resource_use.ProcessUse | None:
     if len(resources) < 2:
         return None
-    times_s = np.array([each.time_us for each in resources]) / US_PER_S
+    times_s = np.array([each.time_us for each in resources]) / constants.US_PER_S
     cores = np.array([each.process_cores for each in resources[1:]])
-    return ProcessUse(
+    return resource_use.ProcessUse(
         wall_s=float(times_s[-1] - times_s[0]),
         cpu_s=float(np.sum(cores * np.diff(times_s))),
         peak_memory_bytes=max(each.memory_bytes for each in resources),
@@ -224,7 +219,7 @@ WITH_LOG = "-with-log"
 
 def take_in(path: Path, ulg: Path | None = None) -> Path:
     """Return the run folder of a black box and its vehicle's log, created beside it if missing."""
-    box = read_black_box(path)
+    box = mcap_file.read_black_box(path)
     folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if ulg is not None:
@@ -232,10 +227,10 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
         from airl_mav.vehicle_log import read_vehicle_log
 
         log = read_vehicle_log(ulg)
-        digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()
+        digest = hashlib.sha256(f"{digest} {files.sha256_of(ulg)}".encode()).hexdigest()
     if (folder / run_folder.RUN_FILE).exists():
         if run_folder.load_info(folder).config.get(DIGEST) != digest:
-            raise UsageError(
+            raise errors.UsageError(
                 f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
             )
         return folder
@@ -244,7 +239,7 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     return folder
 
 
-def logged_episode_of(box: BlackBox, log: VehicleLog) -> run_folder.FlownEpisode:
+def logged_episode_of(box: mcap_file.BlackBox, log: VehicleLog) -> run_folder.FlownEpisode:
     """Return the flight with path, power and motor outputs from the log, or raise UsageError."""
     # Imported here: pyulog is an extra.
     from airl_mav.vehicle_log import align
@@ -258,8 +253,9 @@ def logged_episode_of(box: BlackBox, log: VehicleLog) -> run_folder.FlownEpisode
     path = _path(told, log, clocks.told_us, ahead_us)
     note = (
         f"path, power and motor outputs are those of {log.path.name}; its clock is"
-        f" {-ahead_us / US_PER_MS:+.1f} ms ahead of the recording's, by attitude and velocity in"
-        f" both (which agree to {clocks.error_m_s:.3f} m/s) and {clocks.setpoints} setpoints"
+        f" {-ahead_us / constants.US_PER_MS:+.1f} ms ahead of the recording's, by attitude"
+        f" and velocity in both (which agree to {clocks.error_m_s:.3f} m/s) and"
+        f" {clocks.setpoints} setpoints"
     )
     episode = episode_of(box, path, (note,))
     columns: dict[str, NDArray[Any]] = {

@@ -10,14 +10,8 @@ from dataclasses import replace
 from airl_mav.addons.remote_lockstep.turns import TokenFrameSource, TokenTurns
 from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.turns import SEEN, FlightDigest, WitnessedPolicy
-from airl_mav.scenario.checks import NATIVE_T2_US
-from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.frame_source import open_camera
-from companion.mavsdk_connection import signed
-from companion.mavsdk_link import MavsdkLink
-from companion.pilot import MissionResult, check_camera, fly_mission
-from companion.program import MissionSetup
-from companion.watchdog import ConductedClock
+from airl_mav.scenario import checks, stand_alone
+from companion import frame_source, mavsdk_connection, mavsdk_link, pilot, program, watchdog
 
 ANSWER_TIMEOUT_S = 20.0
 """Timeout after which MAVSDK repeats a command, at most four times [wall s]. Long enough for all
@@ -25,13 +19,13 @@ flights, even if a process is suspended for a while, but MAVSDK notices a lost s
 
 
 def fly_in_lockstep(
-    asked: StandAloneCompanion,
-    mission: MissionSetup,
+    asked: stand_alone.StandAloneCompanion,
+    mission: program.MissionSetup,
     stop: threading.Event,
     abandon: threading.Event,
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
-) -> tuple[MissionResult, dict[str, str]]:
+) -> tuple[pilot.MissionResult, dict[str, str]]:
     """Fly one mission; equal simulator and mission give a bit-identical flight.
 
     `stop` ends the flight early, `abandon` without landing; the simulator sets them, too. `waiting`
@@ -49,17 +43,17 @@ def fly_in_lockstep(
     digest = FlightDigest()
     # The connection timeout also bounds each turn.
     turns = TokenTurns(stop, abandon, asked.connect_timeout)
-    clock = ConductedClock(turns.clock, turns.sleep)
+    clock = watchdog.ConductedClock(turns.clock, turns.sleep)
 
     def announce(phase: str) -> None:
         turns.tell(phase)
         progress(phase, clock.time_us())
 
     with (
-        closing(open_camera(asked.camera, clock)) as frames,
-        signed(asked.connect, asked.signing_key) as url,
+        closing(frame_source.open_camera(asked.camera, clock)) as frames,
+        mavsdk_connection.signed(asked.connect, asked.signing_key) as url,
         # The simulator controls time: ignore silence in wall time.
-        closing(MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
+        closing(mavsdk_link.MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
     ):
         waiting()
         # MAVSDK's timeout ends the wait for a vehicle that rejects unsigned messages, and lets an
@@ -69,13 +63,13 @@ def fly_in_lockstep(
         camera = TokenFrameSource(frames, turns, clock)
         # Turns start before the camera check, which needs frames.
         with turns.taken(link):
-            check_camera(mission.policy, camera, stop, mission.compensator)
+            pilot.check_camera(mission.policy, camera, stop, mission.compensator)
             flown = replace(
                 mission,
                 policy=WitnessedPolicy(mission.policy, digest),
                 # Without injection a fixed t2: the measured one would differ in each flight.
-                latency=mission.latency or FixedSampler(NATIVE_T2_US),
+                latency=mission.latency or FixedSampler(checks.NATIVE_T2_US),
                 start="arm",
             )
-            result = fly_mission(link, camera, flown, clock, stop, abandon, announce, clock)
+            result = pilot.fly_mission(link, camera, flown, clock, stop, abandon, announce, clock)
     return result, {SEEN: digest.lanes()[SEEN]}

@@ -19,9 +19,8 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
-from airl_mav.lockstep.stage import newest_heartbeat
+from airl_mav.lockstep import stage, vehicle
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
-from airl_mav.lockstep.vehicle import DelayedFrames
 from airl_mav.rehearsal.episode import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from firmware_sim.firmware import FrameServer
@@ -111,7 +110,7 @@ class TokenPartner:
 
     def send(self, frames: Sequence[bytes]) -> None:
         """Forward telemetry, immediately if the companion is connected."""
-        self._heartbeat = newest_heartbeat(frames) or self._heartbeat
+        self._heartbeat = stage.newest_heartbeat(frames) or self._heartbeat
         if self._number == 0:
             self._backlog += frames
         if self._heard:
@@ -445,7 +444,7 @@ class Wire:
             self._say(f"onboard: {self.foreign} datagrams dropped so far: not the companion's")
 
 
-class TokenCamera(DelayedFrames):
+class TokenCamera(vehicle.DelayedFrames):
     """Camera of a companion in another process. Implements `firmware.FrameServer`.
 
     Each turn sends only the newest frame that has arrived, as the companion cannot read older ones.

@@ -18,8 +18,7 @@ from pydantic import Field
 
 from airl_mav.arena.geometry import Shape
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import G_PER_KG, MS_PER_S, TICK_S, TICK_US, US_PER_S
-from airl_mav.core.fields import ProfileModel
+from airl_mav.core import constants, fields
 from airl_mav.envs import stopping
 from airl_mav.envs.arena_batch import ArenaBatch
 from airl_mav.envs.cameras import Cameras
@@ -49,7 +48,7 @@ Bound = Literal["body", "sensor", "computer", "hold", "link"]
 """Component that limits the speed."""
 
 
-class Shares(ProfileModel):
+class Shares(fields.ProfileModel):
     """Contributions to the longest reaction time [s]."""
 
     sensor: float
@@ -62,7 +61,7 @@ class Shares(ProfileModel):
     """Link, and a tick of the flight controller."""
 
 
-class RooflinePoint(ProfileModel):
+class RooflinePoint(fields.ProfileModel):
     """Computer on the roofline of its vehicle."""
 
     computer: str
@@ -105,14 +104,14 @@ class RooflinePoint(ProfileModel):
         return 1.0 / self.reaction_s
 
 
-class LeftOut(ProfileModel):
+class LeftOut(fields.ProfileModel):
     """Computer that is not on the roofline, and the reason."""
 
     computer: str
     why: str
 
 
-class Roofline(ProfileModel):
+class Roofline(fields.ProfileModel):
     """Roofline of a vehicle and its computers."""
 
     vehicle: str
@@ -153,14 +152,14 @@ def roofline_point(
     """
     if injection.latency is None:
         raise ValueError(f"{name}: no latency")
-    t2_s = longest_ms(injection.latency) / MS_PER_S
+    t2_s = longest_ms(injection.latency) / constants.MS_PER_S
     loop, vehicle = task.loop, task.vehicle
     measured, reaction = task.safe_velocity(t2_s), loop.reaction_s(t2_s)
     parts: dict[Bound, float] = {
         "sensor": loop.frame_period_s + loop.transport_s,
         "computer": 2.0 * t2_s,
         "hold": loop.hold_s,
-        "link": loop.link_s + TICK_S,
+        "link": loop.link_s + constants.TICK_S,
     }
     braking, room, a = stopping.braking_of(vehicle), task.room_m, max_acceleration(vehicle)
     roof = braking.safe_velocity(0.0, room)
@@ -172,7 +171,7 @@ def roofline_point(
     return RooflinePoint(
         computer=name,
         description=computer.description,
-        mass_g=G_PER_KG * computer.onboard_mass_kg,
+        mass_g=constants.G_PER_KG * computer.onboard_mass_kg,
         watts=computer.onboard_watts,
         latency=injection.label,
         vehicle_kg=vehicle.body.mass_kg,
@@ -481,7 +480,7 @@ def fly_into(
     fleet = Fleet._make(array[moments] for array in flying)
     walls = _walls(fleet.position, task)
     # A setpoint takes effect at the flight controller's next tick.
-    advance(fleet, walls, -(-reaction_us // TICK_US), shared, stopping.RULES, None)
+    advance(fleet, walls, -(-reaction_us // constants.TICK_US), shared, stopping.RULES, None)
     stopping.stop(fleet, walls, shared)
     touched: NDArray[np.bool_] = fleet.verdict == FlightStatus.COLLISION
     return touched
@@ -512,7 +511,7 @@ def greatest_speed(
 
 
 def _us(time_s: float) -> int:
-    return round(time_s * US_PER_S)
+    return round(time_s * constants.US_PER_S)
 
 
 def _reactions_us(

@@ -34,8 +34,7 @@ from airl_mav.policy.registry import PolicyInfo, find_policy, load_learned
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.vehicle import Payload, VehicleProfile, load_vehicle, loaded
 from airl_mav.report.document import Document, print_document, print_place, write_document
-from airl_mav.scenario import model
-from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
+from airl_mav.scenario import aircraft, model
 
 SCHEMA = 1
 
@@ -62,7 +61,7 @@ class RooflineRequest(ProfileModel):
         description="policy whose hold is flown, and whose sensing distance is measured: a name, or"
         " a path to a folder with policy.onnx and card.json",
     )
-    vehicle: VehicleName = DEFAULT_VEHICLE
+    vehicle: aircraft.VehicleName = aircraft.DEFAULT_VEHICLE
     payload: Payload = Field(default_factory=Payload, description="payload")
     sensing_distance_m: float | None = quantity(
         "depth at which an obstacle is taken notice of, from the camera to its surface; by default"

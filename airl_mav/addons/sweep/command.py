@@ -32,17 +32,12 @@ from airl_mav.addons.sweep.summary import (
     write_sweep,
 )
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core.child_process import stop_on_signals
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
-from airl_mav.core.fields import optional, quantity, switch, validated
+from airl_mav.core import child_process, clock, constants, errors, fields
 from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
 from airl_mav.experiments import executors
 from airl_mav.experiments.campaign import open_campaign
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles import arena, loading
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import load_profile
 from airl_mav.report.document import print_document, print_place, write_document
 from airl_mav.scenario.model import Workers
 from airl_mav.training.training_folder import TrainingFolder
@@ -65,37 +60,37 @@ class SweepOptions(Workers):
         description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
         " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
     )
-    out: Path | None = optional("folder of the sweep; by default runs/sweep-<name>")
-    seeds: int | None = quantity(
+    out: Path | None = fields.optional("folder of the sweep; by default runs/sweep-<name>")
+    seeds: int | None = fields.quantity(
         "training seeds of each cell, 1 to N; by default the sweep's",
         "1",
         ge=1,
         le=1000,
         default=None,
     )
-    steps: int | None = optional("decisions of each training; by default the sweep's")
-    episodes: int | None = optional(
+    steps: int | None = fields.optional("decisions of each training; by default the sweep's")
+    episodes: int | None = fields.optional(
         "flights that judge each trained network; by default the sweep's"
     )
-    seed: int | None = optional(
+    seed: int | None = fields.optional(
         "seed of the first of these flights; flight i has seed + i, in every cell; by"
         " default the sweep's"
     )
-    computer: str | None = optional(
+    computer: str | None = fields.optional(
         "computer profile: each cell then shows its decision latency t2 there,"
         " estimated from multiply-accumulates; may change when a sweep goes on"
     )
     device: Literal["cpu", "cuda"] = Field(
         default="cpu", description="device for training: cpu, one core per trial, or cuda"
     )
-    ray_gpus: float | None = quantity(
+    ray_gpus: float | None = fields.quantity(
         "share of a GPU that Ray keeps for each trial; by default 1 with device cuda, else 0",
         "1",
         ge=0,
         le=8,
         default=None,
     )
-    dry_run: bool = switch(
+    dry_run: bool = fields.switch(
         "say what would be done: trials, parameters, multiply-accumulates, decisions;"
         " nothing is trained or written"
     )
@@ -123,20 +118,20 @@ class SweepOptions(Workers):
             if value is not None:
                 data.setdefault(table, {})[field] = value
         for grid in data["grids"]:
-            load_profile("arenas", grid["arena"], ArenaSpec)
+            loading.load_profile("arenas", grid["arena"], arena.ArenaSpec)
             if grid["arena"].endswith(".toml"):
                 # Workers, and other machines, may have another working directory.
                 grid["arena"] = f"{Path(grid['arena']).absolute()}"
-        return validated(SweepConfig, data)
+        return fields.validated(SweepConfig, data)
 
     def executor_settings(self) -> executors.ExecutorSettings:
         """Return the executor settings of the trials, with their GPU share."""
         gpus = self.ray_gpus
         if gpus is not None and self.executor != "ray":
-            raise FieldError("ray_gpus", gpus, "with executor ray")
+            raise errors.FieldError("ray_gpus", gpus, "with executor ray")
         data = {name: getattr(self, name) for name in Workers.model_fields}
         default = 1.0 if self.device == "cuda" else 0.0
-        return validated(
+        return fields.validated(
             executors.ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus}
         )
 
@@ -149,7 +144,7 @@ class SweepOptions(Workers):
         return computer
 
 
-LOOK_US = US_PER_S
+LOOK_US = constants.US_PER_S
 """Interval at which the evaluations of the trainings are read [wall µs]."""
 
 MOST_BARS = 12
@@ -234,7 +229,7 @@ class _TrialBars:
         self._bar = progress.bar("sweep", sum(self._left.values()) or 1.0)
         self._bars: dict[Trial, Bar] = {}
         self._done = 0.0
-        self._clock, self._due_us = WallClock(), 0
+        self._clock, self._due_us = clock.WallClock(), 0
 
     def finished(self, result: TrialResult) -> None:
         """Count a finished trial."""
@@ -287,7 +282,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
     check_installed("train")
     with RichProgress(console) as progress, executors.open_executor(settings) as executor:
         progress.note(f"sweep      {options.name}: {config.description}\nfolder     {path}")
-        with stop_on_signals() as stop:
+        with child_process.stop_on_signals() as stop:
             sweep, error = run_sweep(
                 path,
                 config,
@@ -308,7 +303,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
         return 0
     told = "interrupted" if error is None else "not all trials have ended"
     progress.note(f"{told}: the same command with --out {path} goes on", "yellow")
-    return EXIT_INTERRUPTED if error is None else EXIT_BROKEN
+    return errors.EXIT_INTERRUPTED if error is None else errors.EXIT_BROKEN
 
 
 def _check_device(options: SweepOptions) -> None:
@@ -318,4 +313,4 @@ def _check_device(options: SweepOptions) -> None:
         import torch
 
         if not torch.cuda.is_available():
-            raise FieldError("device", "cuda", "cpu: torch finds no GPU here")
+            raise errors.FieldError("device", "cuda", "cpu: torch finds no GPU here")

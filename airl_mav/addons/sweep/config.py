@@ -10,30 +10,26 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import Each, ProfileModel, quantity
+from airl_mav.core import errors, fields
 from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
-from airl_mav.policy.card import outputs_of
-from airl_mav.policy.card_writing import NetworkSize, template_size
-from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.projections import CHANNELS
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.policy import card, card_writing
+from airl_mav.profiles import loading, projections, vehicle
 from airl_mav.training.config import SELECTION_SEED, NetworkSpec, TrainingConfig
 
 GREATEST_LAYERS, GREATEST_FILTERS = 16, 256
 """Limits of a template in `training.config.NetworkSpec`."""
 
 
-class Grid(ProfileModel):
+class Grid(fields.ProfileModel):
     """Cells of one arena: every number of layers with every number of filters."""
 
     arena: str = Field(description="arena profile: a shipped name, or a path to a .toml")
-    layers: Annotated[tuple[int, ...], Each(1, GREATEST_LAYERS, ascending=True)] = quantity(
-        "convolutions, and dense layers, of the template", "1"
+    layers: Annotated[tuple[int, ...], fields.Each(1, GREATEST_LAYERS, ascending=True)] = (
+        fields.quantity("convolutions, and dense layers, of the template", "1")
     )
-    filters: Annotated[tuple[int, ...], Each(1, GREATEST_FILTERS, ascending=True)] = quantity(
-        "filters a convolution, and units a dense layer", "1"
+    filters: Annotated[tuple[int, ...], fields.Each(1, GREATEST_FILTERS, ascending=True)] = (
+        fields.quantity("filters a convolution, and units a dense layer", "1")
     )
 
     @property
@@ -49,13 +45,13 @@ class Grid(ProfileModel):
         return self
 
 
-class Examination(ProfileModel):
+class Examination(fields.ProfileModel):
     """Evaluation flights of a trained network, in the whole arena of its training."""
 
-    episodes: int = quantity(
+    episodes: int = fields.quantity(
         "flights of each trained network, on the same seeds", "1", ge=1, le=100_000, default=100
     )
-    seed: int = quantity(
+    seed: int = fields.quantity(
         "seed of the first flight; flight i has seed + i", "1", ge=0, lt=SELECTION_SEED, default=1
     )
 
@@ -69,11 +65,11 @@ class Examination(ProfileModel):
         return self
 
 
-class SweepConfig(ProfileModel):
+class SweepConfig(fields.ProfileModel):
     """Configuration of an architecture search."""
 
     description: str = Field(description="one line for people")
-    seeds: Annotated[tuple[int, ...], Each(0, 2**31)] = quantity(
+    seeds: Annotated[tuple[int, ...], fields.Each(0, 2**31)] = fields.quantity(
         "of the trainings: each cell is trained once with each", "1"
     )
     grids: tuple[Grid, ...] = Field(description="arenas and their cells", min_length=1)
@@ -113,7 +109,7 @@ class SweepConfig(ProfileModel):
 
 def load_sweep(name: str) -> SweepConfig:
     """Load a sweep, built-in or by path. Raises UsageError; see `load_profile`."""
-    return load_profile("sweeps", name, SweepConfig)
+    return loading.load_profile("sweeps", name, SweepConfig)
 
 
 @dataclass(frozen=True, order=True)
@@ -172,20 +168,20 @@ def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
     )
 
 
-def size_of(config: SweepConfig, trial: Trial) -> NetworkSize:
+def size_of(config: SweepConfig, trial: Trial) -> card_writing.NetworkSize:
     """Return the size of a trial's network, as it flies."""
     environment = config.training.environment
     if environment.cameras:
         names = ", ".join(environment.cameras)
-        raise FieldError("training.environment.cameras", names, "none in a sweep")
-    camera = environment.camera.of(load_vehicle(environment.vehicle).camera)
-    return template_size(
+        raise errors.FieldError("training.environment.cameras", names, "none in a sweep")
+    camera = environment.camera.of(vehicle.load_vehicle(environment.vehicle).camera)
+    return card_writing.template_size(
         trial.layers,
         trial.filters,
         environment.image_height_px,
         environment.image_width_px,
-        outputs_of(environment.action_spec),
-        CHANNELS[camera.kind] * environment.frames,
+        card.outputs_of(environment.action_spec),
+        projections.CHANNELS[camera.kind] * environment.frames,
     )
 
 

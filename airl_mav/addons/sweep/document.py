@@ -15,8 +15,7 @@ from rich.console import Console
 
 from airl_mav.addons.sweep import summary
 from airl_mav.addons.sweep.config import SweepConfig, training_of, trials
-from airl_mav.report import document, theme
-from airl_mav.report.heatmap import Field, HeatMap, heat_picture
+from airl_mav.report import document, heatmap, theme
 from airl_mav.report.theme import FigureImage
 
 Described = tuple[document.Column, Callable[[summary.NetworkSummary], str]]
@@ -156,7 +155,7 @@ def success_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
     known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
     rates = [cell.success_rate.value or 0.0 for cell in known]
     fields = [
-        Field(100.0 * rate, _success_text(cell), marked=cell is best)
+        heatmap.Field(100.0 * rate, _success_text(cell), marked=cell is best)
         for cell, rate in zip(known, rates, strict=True)
     ]
     heat = _heat_map(
@@ -171,7 +170,7 @@ def success_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
     )
     told = ", ".join(f"{cell.network} {percent(cell.success_rate.value)} %" for cell in known)
     alt = f"Success by layers and filters in {arena}: {told}"
-    return heat_picture(f"sweep-{arena}", alt, heat)
+    return heatmap.heat_picture(f"sweep-{arena}", alt, heat)
 
 
 def _success_text(cell: summary.NetworkSummary) -> str:
@@ -203,7 +202,7 @@ def cost_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
         sweep,
         arena,
         cells,
-        [Field(value, text) for value, text in zip(values, texts, strict=True)],
+        [heatmap.Field(value, text) for value, text in zip(values, texts, strict=True)],
         title=title,
         unit=unit,
         limits=(min(values), max(max(values), 1.01 * min(values))),
@@ -211,19 +210,19 @@ def cost_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
         logarithmic=True,
     )
     alt = f"{heat.title} by layers and filters, {arena}"
-    return heat_picture(f"sweep-size-{arena}", alt, heat)
+    return heatmap.heat_picture(f"sweep-size-{arena}", alt, heat)
 
 
 def _heat_map(
     sweep: summary.Sweep,
     arena: str,
     cells: Sequence[summary.NetworkSummary],
-    fields: Sequence[Field],
+    fields: Sequence[heatmap.Field],
     **look: Any,
-) -> HeatMap:
+) -> heatmap.HeatMap:
     """Return a heat map of some networks in the grid of an arena."""
     grid = next(grid for grid in sweep.config.grids if grid.name == arena)
-    return HeatMap(
+    return heatmap.HeatMap(
         rows=grid.layers,
         row_title="layers",
         columns=grid.filters,

@@ -13,8 +13,7 @@ import scipy
 from pydantic import TypeAdapter
 
 from airl_mav.addons.sweep.config import SweepConfig, Trial, TrialResult, size_of, trials
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import read_typed, write_json
+from airl_mav.core import errors, files
 from airl_mav.experiments.campaign import Declaration, DeclaredCell
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
@@ -65,9 +64,9 @@ class SweepFolder:
         path = self.trial_path(trial) / RESULT_FILE
         if not path.exists():
             return None
-        held = read_typed(path, _RESULT_FILE, SCHEMA, "result")
+        held = files.read_typed(path, _RESULT_FILE, SCHEMA, "result")
         if held.result.trial != trial or held.evaluation != self.evaluation:
-            raise UsageError(
+            raise errors.UsageError(
                 f"{path}: of another trial or of other flights; accepted: another --out"
             )
         return held.result
@@ -80,7 +79,7 @@ class SweepFolder:
         """End a trial, and remove the files needed only to resume."""
         folder = self.trial_path(result.trial)
         held = _ResultFile(self.evaluation, result)
-        write_json(folder / RESULT_FILE, _RESULT_FILE.dump_python(held, mode="json"))
+        files.write_json(folder / RESULT_FILE, _RESULT_FILE.dump_python(held, mode="json"))
         shutil.rmtree(checkpoints, ignore_errors=True)
 
 
@@ -266,7 +265,7 @@ def estimated_ms(computer: ComputerProfile, macs: int) -> float:
     """Return a network's mean t2 [ms] by MACs. Raises UsageError without workload."""
     latency = choose_injection(computer, ESTIMATE, macs=macs).latency
     if not isinstance(latency, LatencyDistribution):
-        raise UsageError("--computer: has no workload to estimate from")
+        raise errors.UsageError("--computer: has no workload to estimate from")
     if latency.samples_ms is not None:
         return float(np.mean(latency.samples_ms))
     assert latency.mean_ms is not None  # noqa: S101 (every other distribution has one)
@@ -285,7 +284,7 @@ def write_sweep(sweep: Sweep) -> None:
         "best": {arena: _best(sweep, arena) for arena in sweep.arenas},
         "cells": [_network_data(cell) for cell in sweep.cells],
     }
-    write_json(sweep.folder.path / SWEEP_FILE, data)
+    files.write_json(sweep.folder.path / SWEEP_FILE, data)
 
 
 def _best(sweep: Sweep, arena: str) -> dict[str, Any] | None:

@@ -23,9 +23,7 @@ from airl_mav.core.fields import ProfileModel
 from airl_mav.core.progress import new_console
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, GREATEST_PORT, VehicleName
-from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.stand_alone import CameraName
+from airl_mav.scenario import aircraft, model, stand_alone
 
 GIMBAL_PORT = 13_280
 """Port to which PX4 SITL's instance 0 forwards MAVLink for a gimbal (px4-rc.mavlink), like the
@@ -44,8 +42,8 @@ class VideoOptions(ProfileModel):
         airl video --vehicle quad-rig --camera-name down
     """
 
-    camera: CameraName = "tcp://127.0.0.1:5600"
-    vehicle: VehicleName = DEFAULT_VEHICLE
+    camera: stand_alone.CameraName = "tcp://127.0.0.1:5600"
+    vehicle: aircraft.VehicleName = aircraft.DEFAULT_VEHICLE
     camera_name: str | None = Field(
         default=None,
         description="additional camera of the vehicle to show; default: the main camera",
@@ -97,8 +95,8 @@ def receiver_of(address: str, field: str = "to") -> tuple[str, int]:
     """Return the address of HOST:PORT. Raises FieldError, naming the field, if it is invalid."""
     host, _, port = address.rpartition(":")
     # RTCP uses the next port.
-    if not host or not port.isdecimal() or not 1 <= int(port) < GREATEST_PORT:
-        raise FieldError(field, address, f"HOST:PORT, port 1..{GREATEST_PORT - 1}")
+    if not host or not port.isdecimal() or not 1 <= int(port) < aircraft.GREATEST_PORT:
+        raise FieldError(field, address, f"HOST:PORT, port 1..{aircraft.GREATEST_PORT - 1}")
     try:
         socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)
     except OSError as error:
@@ -109,7 +107,7 @@ def receiver_of(address: str, field: str = "to") -> tuple[str, int]:
 MODULE = "airl_mav.addons.video.command"
 
 
-def video_words(asked: Scenario, to: str) -> list[str]:
+def video_words(asked: model.Scenario, to: str) -> list[str]:
     """Return the options of `airl video` for a camera and a viewer; FieldError if unsupported."""
     if asked.level != "sitl":
         raise FieldError(
@@ -123,7 +121,7 @@ def video_words(asked: Scenario, to: str) -> list[str]:
     return [*words, "--connect", _network(asked) or "None"]
 
 
-def _network(asked: Scenario) -> str | None:
+def _network(asked: model.Scenario) -> str | None:
     """Return the camera's connection to the vehicle; None for a signed link or other firmware."""
     if asked.firmware == "px4":
         return f"udpin://{LOOPBACK}:{GIMBAL_PORT + asked.real.instance}"
@@ -133,7 +131,7 @@ def _network(asked: Scenario) -> str | None:
 
 
 def shown_beside(
-    asked: Scenario, to: str, say: Callable[[str], None]
+    asked: model.Scenario, to: str, say: Callable[[str], None]
 ) -> AbstractContextManager[None]:
     """Return a context that shows the flights' camera. Raises FieldError if unsupported."""
     receiver_of(to, "video")

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame, FurtherImage, nearness, rgb_of
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.errors import FieldError
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
 from companion.frame_source import FrameSource, OpenCamera, ReceivedFrame, open_named_camera
@@ -102,7 +101,7 @@ class RtpVideo:
         if self._first_us is None:
             self._first_us = time_us
         # The stream starts at 0 and uses RTP's 90 kHz clock.
-        pts = (time_us - self._first_us) * _CLOCK_HZ // US_PER_S
+        pts = (time_us - self._first_us) * _CLOCK_HZ // constants.US_PER_S
         if pts <= self._last_pts:
             return
         self._last_pts = pts
@@ -253,7 +252,7 @@ class CameraComponent:
         made = camera_messages(self._stream, running=self.running)
         for name in (MESSAGES[number] for number in wanted):
             if not name.startswith("VIDEO"):
-                made[name]["time_boot_ms"] = self._clock.time_us() // US_PER_MS
+                made[name]["time_boot_ms"] = self._clock.time_us() // constants.US_PER_MS
             self._send(name, made[name], sender)
 
     def _carried_out(self, command: int, one: int, two: int) -> tuple[int, tuple[int, ...]]:
@@ -347,7 +346,7 @@ class ShownCamera(NamedTuple):
             return self.profile.camera
         if self.name not in self.profile.cameras:
             has = ", ".join(self.profile.cameras) or "left out, as it has its main one alone"
-            raise FieldError("camera_name", self.name, f"of vehicle {self.vehicle}: {has}")
+            raise errors.FieldError("camera_name", self.name, f"of vehicle {self.vehicle}: {has}")
         return self.profile.cameras[self.name]
 
     def open(self, clock: Clock) -> OpenCamera:
@@ -362,7 +361,7 @@ class ShownCamera(NamedTuple):
             return frame
         if self.name not in frame.further:
             has = ", ".join(frame.further) or "left out, as there are those of the main one alone"
-            raise FieldError("camera_name", self.name, f"whose images come: {has}")
+            raise errors.FieldError("camera_name", self.name, f"whose images come: {has}")
         return frame.further[self.name]
 
 

@@ -7,14 +7,10 @@ from typing import Any
 
 import viser
 
-from airl_mav.addons.view import replayed_flight
+from airl_mav.addons.view import replayed_flight, view_messages, view_server, viser_scene
 from airl_mav.addons.view.panel import Panel
-from airl_mav.addons.view.view_messages import Shown
-from airl_mav.addons.view.view_server import Watchers
-from airl_mav.addons.view.viser_scene import FlightScene
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.report.scene import OTHER
 
@@ -56,15 +52,15 @@ class ReplayPage:
     ) -> None:
         """Build the page at the start of flight `first`; None = the worst flight."""
         self._run, self._beside, self._runs = run, beside, runs
-        self._shown, self._others = Shown(), Shown()
-        self._scene = FlightScene(server)
-        self._ghost = FlightScene(server, "/beside", OTHER)
+        self._shown, self._others = view_messages.Shown(), view_messages.Shown()
+        self._scene = viser_scene.FlightScene(server)
+        self._ghost = viser_scene.FlightScene(server, "/beside", OTHER)
         self._records = {_label(record): record for record in run.records}
         self._gui: Any = server.gui
         self._panel = Panel(
             server, run.title, image="what the camera saw for the decision", head=self._add_head
         )
-        self._watchers = Watchers(server)
+        self._watchers = view_server.Watchers(server)
         self._playing = True
         self._dirty = True
         self._behind = False
@@ -142,7 +138,7 @@ class ReplayPage:
         """Run an action; on UsageError, show a notification on the page and return False."""
         try:
             act()
-        except UsageError as error:
+        except errors.UsageError as error:
             event.client.add_notification("It cannot be shown", str(error), color="red")
             return False
         return True
@@ -198,7 +194,7 @@ class ReplayPage:
         self._other = None
         if self._beside is not None and (same := self._beside.same(record)) is not None:
             self._other = self._beside.flight(same)
-        self._others = Shown()
+        self._others = view_messages.Shown()
         if self._other is not None:
             self._other.begin(self._others)
         if self._pick.value != _label(record):
@@ -210,14 +206,14 @@ class ReplayPage:
         record = self._flight.record
         if record.navigation_us is None:
             return 0.0
-        return max(0.0, (record.navigation_us - record.started_us) / US_PER_S - BEFORE_S)
+        return max(0.0, (record.navigation_us - record.started_us) / constants.US_PER_S - BEFORE_S)
 
     def _next_decision_s(self) -> float:
         now_us = self._flight.time_us(self._seconds)
         later = self._flight.sent_us[self._flight.sent_us > now_us + 1]
         if not len(later):
             return self._flight.duration_s
-        return (int(later[0]) - self._flight.record.started_us) / US_PER_S
+        return (int(later[0]) - self._flight.record.started_us) / constants.US_PER_S
 
     def _go_to(self, seconds: float, *, slid: bool = False) -> None:
         self._seconds = min(max(0.0, seconds), self._flight.duration_s)
@@ -238,7 +234,7 @@ class ReplayPage:
         while True:
             clock.sleep_until(before_us + DRAW_US)
             now_us = clock.time_us()
-            self.advance(min(now_us - before_us, LATE_US) / US_PER_S)
+            self.advance(min(now_us - before_us, LATE_US) / constants.US_PER_S)
             before_us = now_us
 
     def advance(self, wall_s: float) -> None:

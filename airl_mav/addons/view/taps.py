@@ -14,15 +14,12 @@ from airl_mav.addons.view.viewer import REAL_TIME, Asked, Feed, Pace
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import US_PER_MS
-from airl_mav.core.frames import Goal
+from airl_mav.core import constants, frames
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.latency.injection import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction import Compensator
-from airl_mav.rehearsal.channel import State, Text
-from airl_mav.rehearsal.live_view import ViewAddresses
-from airl_mav.rehearsal.observer import WARNING, Observer
+from airl_mav.rehearsal import channel, live_view, observer
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.pilot import SentDecision
 from firmware_sim.autopilot.commander import FlightPhase
@@ -48,7 +45,7 @@ class Hand:
         if t2_ms is None:
             return None
         self.touched = True
-        return round(t2_ms * US_PER_MS)
+        return round(t2_ms * constants.US_PER_MS)
 
     def compensates(self) -> bool:
         """Return True if this decision is compensated."""
@@ -108,7 +105,7 @@ PICTURE_EVERY_US = 100_000
 class SimulationTap:
     """Sender of the simulation's messages. Call from one thread."""
 
-    def __init__(self, ends: ViewAddresses, scenario: ResolvedScenario) -> None:
+    def __init__(self, ends: live_view.ViewAddresses, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
         self._scenario = scenario
@@ -181,7 +178,7 @@ class SimulationTap:
 class CompanionTap:
     """Sender of a companion's decisions; applies viewers' settings. Call from one thread."""
 
-    def __init__(self, ends: ViewAddresses, scenario: ResolvedScenario) -> None:
+    def __init__(self, ends: live_view.ViewAddresses, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
         self._asked = Asked(ends, messages.Steering())
@@ -235,10 +232,10 @@ INFO = 6
 """MAV_SEVERITY_INFO."""
 
 
-class ViewObserver(Observer):
+class ViewObserver(observer.Observer):
     """Reports to a view, and forwards all events to another observer."""
 
-    def __init__(self, ends: ViewAddresses, onwards: Observer) -> None:
+    def __init__(self, ends: live_view.ViewAddresses, onwards: observer.Observer) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
         self._onwards = onwards
@@ -249,7 +246,7 @@ class ViewObserver(Observer):
         self._feed.send(PhaseStart(time_us=0, phase=what))
         self._onwards.waiting(what)
 
-    def episode(self, index: int, seed: int, goal: Goal) -> None:
+    def episode(self, index: int, seed: int, goal: frames.Goal) -> None:
         """Report the start of an episode."""
         self._feed.send(Flight(index=index, seed=seed, goal=goal))
         self._onwards.episode(index, seed, goal)
@@ -259,11 +256,11 @@ class ViewObserver(Observer):
         self._feed.send(PhaseStart(time_us=time_us, phase=phase))
         self._onwards.phase(phase, time_us)
 
-    def state(self, state: State, started_us: int) -> None:
+    def state(self, state: channel.State, started_us: int) -> None:
         """Forward the state: the view gets it from the simulation, and more often."""
         self._onwards.state(state, started_us)
 
-    def text(self, text: Text) -> None:
+    def text(self, text: channel.Text) -> None:
         """Report a text of the autopilot."""
         self._feed.send(Said(time_us=text.time_us, severity=text.severity, text=text.text))
         self._onwards.text(text)
@@ -273,12 +270,12 @@ class ViewObserver(Observer):
         how = f"flight {record.index:03d}: {record.outcome.value}, {record.reason}"
         self._feed.send(Said(time_us=record.ended_us, severity=INFO, text=how))
         for note in record.notes:
-            self._feed.send(Said(time_us=None, severity=WARNING, text=note))
+            self._feed.send(Said(time_us=None, severity=observer.WARNING, text=note))
         self._onwards.finished(record)
 
     def lost(self, what: str) -> None:
         """Report that an episode begins again."""
-        self._feed.send(Said(time_us=None, severity=WARNING, text=what))
+        self._feed.send(Said(time_us=None, severity=observer.WARNING, text=what))
         self._onwards.lost(what)
 
     def close(self) -> None:
@@ -292,7 +289,7 @@ class FlightTap:
     Call the companion's methods on its thread, all others on the waiting conductor's thread.
     """
 
-    def __init__(self, ends: ViewAddresses, scenario: ResolvedScenario) -> None:
+    def __init__(self, ends: live_view.ViewAddresses, scenario: ResolvedScenario) -> None:
         """Connect to a viewer; the pace is real time until a spectator changes it."""
         self._open = ExitStack()
         self._simulation = self._open.enter_context(closing(SimulationTap(ends, scenario)))

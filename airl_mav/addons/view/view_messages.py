@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_MS, US_PER_S, CommandKind
-from airl_mav.core.frames import Goal, goal_distance_m
+from airl_mav.core import constants, frames
 from airl_mav.profiles.projections import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 from airl_mav.rehearsal.live_view import ViewAddresses
@@ -90,7 +89,7 @@ class Episode(ViewMessage):
     arena: Arena | None
     """Arena; None = an endless floor."""
     vehicle: VehicleShape
-    goal: Goal
+    goal: frames.Goal
     """North, east and optionally down [m]."""
     goal_radius_m: float
 
@@ -135,7 +134,7 @@ class Decided(ViewMessage):
     setpoint: Quaternion
     """Velocity forward, right, down [m/s] in the heading frame and yaw rate [rad/s]. For other
     `commands`, the fields of `policy.actions.Attitude` or `BodyRates`."""
-    commands: CommandKind = "velocity"
+    commands: constants.CommandKind = "velocity"
     compensated: bool
     """True if the policy's input was predicted by latency compensation."""
     shape: Shape
@@ -148,7 +147,7 @@ class Flight(ViewMessage):
     kind: Literal["flight"] = "flight"
     index: int
     seed: int
-    goal: Goal
+    goal: frames.Goal
 
 
 class PhaseStart(ViewMessage):
@@ -352,7 +351,7 @@ class Shown:
         """Time since the episode's start [simulated s]."""
         if self.vehicle is None or self.episode is None:
             return 0.0
-        return (self.vehicle.time_us - self.episode.started_us) / US_PER_S
+        return (self.vehicle.time_us - self.episode.started_us) / constants.US_PER_S
 
     @property
     def flies_setpoints(self) -> bool:
@@ -365,14 +364,14 @@ class Shown:
         """Age of the image behind the current command [ms]; None without such a command."""
         if self.decided is None or self.vehicle is None or not self.flies_setpoints:
             return None
-        return max(0.0, (self.vehicle.time_us - self.decided.captured_us) / US_PER_MS)
+        return max(0.0, (self.vehicle.time_us - self.decided.captured_us) / constants.US_PER_MS)
 
     @property
     def t2_ms(self) -> float | None:
         """Inference time t2 of the newest decision [ms]; None before the first decision."""
         if self.decided is None:
             return None
-        return (self.decided.ready_us - self.decided.began_us) / US_PER_MS
+        return (self.decided.ready_us - self.decided.began_us) / constants.US_PER_MS
 
     @property
     def command(self) -> NDArray[np.float64] | None:
@@ -391,4 +390,4 @@ class Shown:
         """Distance to the goal [m]; horizontal for a goal without a height."""
         if self.vehicle is None or self.episode is None:
             return None
-        return goal_distance_m(self.episode.goal, self.vehicle.position)
+        return frames.goal_distance_m(self.episode.goal, self.vehicle.position)

@@ -13,10 +13,8 @@ import zmq
 from pydantic import ValidationError
 
 from airl_mav.addons.view import view_messages
-from airl_mav.core.child_process import ChildProcess
+from airl_mav.core import child_process, constants, errors
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import LOOPBACK, US_PER_S
-from airl_mav.core.errors import FieldError
 from airl_mav.rehearsal.live_view import ViewAddresses, ViewError
 from airl_mav.scenario.resolve import ResolvedScenario
 
@@ -63,7 +61,7 @@ class Pace:
         if (
             clock is None
             or clock.speed != asked.speed
-            or clock.time_us() - time_us > BEHIND_S * US_PER_S * clock.speed
+            or clock.time_us() - time_us > BEHIND_S * constants.US_PER_S * clock.speed
         ):
             self._clock = clock = self._new_clock(asked.speed)
             clock.epoch_ns -= int(time_us * 1_000 / asked.speed)
@@ -116,7 +114,7 @@ class Viewer:
     def __init__(self, request: view_messages.ViewSettings) -> None:
         """Start the viewer and wait for it; raise FieldError if the port is in use."""
         self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
-        self._child = ChildProcess(
+        self._child = child_process.ChildProcess(
             [sys.executable, "-m", MODULE],
             Path(self._folder.name) / "view.log",
             capture_stdout=True,
@@ -124,7 +122,7 @@ class Viewer:
         try:
             answer = self._answer(request)
             if answer.ends is None:
-                raise FieldError(
+                raise errors.FieldError(
                     "view_port", request.port, problem="the port is taken; accepted: a free one"
                 )
         except BaseException:
@@ -132,7 +130,7 @@ class Viewer:
             raise
         self.ends: ViewAddresses = answer.ends
         """Addresses for flights to connect to."""
-        self.url = f"http://{LOOPBACK}:{answer.port}"
+        self.url = f"http://{constants.LOOPBACK}:{answer.port}"
         """URL of the page for a browser."""
 
     def _answer(self, request: view_messages.ViewSettings) -> view_messages.ViewAnswer:
@@ -211,7 +209,7 @@ class Asked:
             with suppress(ValidationError):
                 self._newest = view_messages.Steering.model_validate_json(self._socket.recv())
             self._heard_us = self._clock.time_us()
-        elif self._clock.time_us() - self._heard_us > SILENCE_S * US_PER_S:
+        elif self._clock.time_us() - self._heard_us > SILENCE_S * constants.US_PER_S:
             self._newest = self._default
         return self._newest
 
@@ -237,7 +235,7 @@ class Ends:
         socket: zmq.Socket[bytes] = self._context.socket(kind)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.RCVHWM if kind == zmq.PULL else zmq.SNDHWM, QUEUED)
-        socket.bind(f"tcp://{LOOPBACK}:*")
+        socket.bind(f"tcp://{constants.LOOPBACK}:*")
         return socket
 
     def take(self, wait_s: float) -> list[tuple[view_messages.Told, view_messages.Image | None]]:

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.addons.view import view_messages
+from airl_mav.addons.view import view_messages, viewer
 from airl_mav.addons.view.view_messages import OFFBOARD, ViewSettings
-from airl_mav.addons.view.viewer import Feed, Pace
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.evaluation import Trace
@@ -105,7 +104,7 @@ class WatchedTraining(TrainingProgress):
         self._standing = _Standing()
         self._newest: deque[Taped] = deque(maxlen=1)
         self._said: deque[view_messages.Said] = deque(maxlen=16)
-        self._feed, self._pace = Feed(ends), Pace(ends, SPEED)
+        self._feed, self._pace = viewer.Feed(ends), viewer.Pace(ends, SPEED)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watched training", daemon=True)
         self._thread.start()

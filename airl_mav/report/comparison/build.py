@@ -17,10 +17,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import aggregate, compare_pairs, pair_by_seed, percent_change
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples, summarize
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import document, run_tables
 from airl_mav.report.comparison import comparison_model
 from airl_mav.report.comparison.comparison_model import Comparison
-from airl_mav.report.document import Document, Facts, Section, provenance_facts, run_link
-from airl_mav.report.run_tables import setup_rows
 
 SHORT_NAME = 14
 """Maximum length of names that are used as marks."""
@@ -156,7 +155,7 @@ def _task(episode: EpisodeRecord) -> tuple[str, int, Goal]:
 
 
 def _facts(run: LoadedRun) -> dict[str, str]:
-    facts = dict(setup_rows(run))
+    facts = dict(run_tables.setup_rows(run))
     facts["flights"] = f"{len(tests_of(run)):,}"
     seeds = [episode.seed for episode in run.episodes]
     low, high = min(seeds), max(seeds)
@@ -291,18 +290,18 @@ def comparison_document(
     folder: Path,
     *,
     kicker: str,
-    sections: Sequence[Section],
-    facts: Facts,
+    sections: Sequence[document.Section],
+    facts: document.Facts,
     lead: str = "",
     facts_title: str = "What flew",
-) -> Document:
+) -> document.Document:
     """Return the dated document of a comparison, with run links relative to `folder`."""
     first = comparison.runs[0]
     made = runs[first.name].info
     created = made.created_utc.replace("T", " ").replace("+00:00", " UTC")
     version = made.versions.get("airl-mav", "")
     several = len(comparison.groups) > 1
-    return Document(
+    return document.Document(
         name=comparison.kind,
         title=comparison.title,
         kicker=f"{kicker} · {created}",
@@ -313,14 +312,14 @@ def comparison_document(
         facts_title=facts_title,
         remarks=tuple(comparison.facts.get("remarks") or ()),
         runs=tuple(
-            run_link(
+            document.run_link(
                 f"{Path(run.entry.group).stem}: {run.heading}" if several else run.heading,
                 runs[run.name].path,
                 folder,
             )
             for run in comparison.runs
         ),
-        provenance=provenance_facts(made.machine, made.git, made.versions),
+        provenance=document.provenance_facts(made.machine, made.git, made.versions),
         configurations=((first.heading, json.dumps(made.config, indent=2, ensure_ascii=False)),),
         footer=(
             f"airl-mav {version} · machine, versions and configuration: those of {first.heading}; "

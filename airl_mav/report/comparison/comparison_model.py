@@ -9,8 +9,7 @@ from typing import Any, Literal, TypeVar, get_args
 from pydantic import TypeAdapter
 
 from airl_mav.core.files import read_typed, write_json
-from airl_mav.flight.episode_record import Setup
-from airl_mav.flight.statistics import Aggregate, PairedComparison
+from airl_mav.flight import episode_record, statistics
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, Stage, Summary
 from airl_mav.profiles.loading import PublishedGap, PublishedRun
 
@@ -88,12 +87,12 @@ class ComparedRun:
     mark: str
     """Abbreviation of the run for narrow columns: its role in the comparison (`target`), a short
     name, or a letter."""
-    setup: Setup
+    setup: episode_record.Setup
     planned: int
     flown: int
     facts: dict[str, str]
     """Setup of the run as text, by term."""
-    quality: Aggregate
+    quality: statistics.Aggregate
     stages: dict[str, Summary]
     """Durations of decision stages by stage key [µs], without invalid flights."""
     slipped_us: int
@@ -145,7 +144,7 @@ class Contrast:
     """Differences between a run and a reference on the same seeds."""
 
     entry: ContrastEntry
-    paired: PairedComparison
+    paired: statistics.PairedComparison
     unmatched: int
     """Flights without a pair: the reference flew their seed in another arena or to another goal."""
     t2_percent: float | None

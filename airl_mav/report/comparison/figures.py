@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import draw_arena
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.statistics import Estimate
+from airl_mav.flight import judge, statistics
 from airl_mav.latency.stages import ALL_STAGES, Samples
 from airl_mav.rehearsal.run_folder import LoadedRun, arena_of
 from airl_mav.report import theme
@@ -68,7 +67,7 @@ def contrast_pictures(
     return pictures
 
 
-def _draw_estimate(ax: Axes, row: int, estimate: Estimate) -> list[float]:
+def _draw_estimate(ax: Axes, row: int, estimate: statistics.Estimate) -> list[float]:
     """Draw an estimate with its interval and numbers; return the values the axis must include."""
     n = f"n = {estimate.n:,}"
     ax.annotate(
@@ -212,7 +211,7 @@ def flight_panels(
             continue
         rate, path = figures.quality.success_rate, figures.quality.distance_m
         if len(tests) < rate.n:
-            reached = sum(episode.outcome is Outcome.SUCCESS for episode in tests)
+            reached = sum(episode.outcome is judge.Outcome.SUCCESS for episode in tests)
             detail = f"{len(tests)} flights, {reached} reached the goal"
         else:
             success = NONE if rate.value is None else f"{100 * rate.value:.{rate_digits(rate)}f} %"
@@ -242,7 +241,7 @@ def seed_picture(
             draw_arena(arena, ax, goal_radius_m=flight.goal_radius_m)
         style, path = theme.line_style(number), run.trajectories.get(flight.index)
         told = OUTCOME_LABELS[flight.outcome]
-        if flight.outcome is Outcome.SUCCESS and flight.quality is not None:
+        if flight.outcome is judge.Outcome.SUCCESS and flight.quality is not None:
             told = f"{flight.quality.flight_time_s:.1f} s"
         points = np.zeros((0, 2)) if path is None else path_points(path, flight.ended_us)
         (line,) = ax.plot(

@@ -14,12 +14,9 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.loading import load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report import theme
-from airl_mav.report.comparison import comparison_model
-from airl_mav.report.comparison.build import compare, comparison_document
-from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
+from airl_mav.report import measures, theme
+from airl_mav.report.comparison import build, comparison_model, tables
 from airl_mav.report.document import Column, Document, Section, TableView, ms
-from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, QualityMeasure
 from airl_mav.report.theme import FigureImage
 
 
@@ -77,7 +74,7 @@ def curves_picture(
 AGAINST_FIRST, STEP = "against-first", "step"
 """Keys of the contrasts with the first latency and with the previous latency."""
 
-LOSSES = (FLIGHT_TIME, DISTANCE, ENERGY)
+LOSSES = (measures.FLIGHT_TIME, measures.DISTANCE, measures.ENERGY)
 
 FEWEST = 10
 """Minimum number of pairs for a conclusion about a step."""
@@ -103,7 +100,7 @@ def build_latency_sweep(
                 comparison_model.ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}")
             )
     title = "Latency sweep"
-    comparison = compare(
+    comparison = build.compare(
         runs, contrasts, kind="latency-sweep", title=title, facts=facts, entries=entries
     )
     told = [line for policy in comparison.groups for line in _verdict(comparison, policy)]
@@ -138,7 +135,7 @@ def _success_trend(steps: Sequence[comparison_model.Contrast]) -> str:
     return "never rises"
 
 
-def _monotone(measure: QualityMeasure, steps: Sequence[comparison_model.Contrast]) -> str:
+def _monotone(measure: measures.QualityMeasure, steps: Sequence[comparison_model.Contrast]) -> str:
     changes = [(step.entry.title, measure.change(step.paired).difference) for step in steps]
     known = [(title, d) for title, d in changes if d.value is not None and d.n >= FEWEST]
     if not known:
@@ -163,13 +160,13 @@ def latency_quality_table(comparison: comparison_model.Comparison, policy: str) 
     columns = (
         Column("latency", number=False),
         Column("t2", "ms"),
-        *(Column(measure.title, measure.unit) for measure in MEASURES),
+        *(Column(measure.title, measure.unit) for measure in measures.MEASURES),
     )
     rows = tuple(
         (
             run.label,
             ms(run.stages["t2"].mean, 0),
-            *(measure.with_interval(run.quality) for measure in MEASURES),
+            *(measure.with_interval(run.quality) for measure in measures.MEASURES),
         )
         for run in comparison.group(policy)
     )
@@ -190,7 +187,7 @@ def published_curve_table() -> TableView:
         (
             f"{each.latency_ms:g} ms",
             *(f"{v:.2f}" for v in (each.flight_time_s, each.distance_m, each.energy_kj)),
-            *(signed(loss) for loss in _published_losses(number)),
+            *(tables.signed(loss) for loss in _published_losses(number)),
         )
         for number, each in enumerate(load_published().degradation)
     )
@@ -255,7 +252,7 @@ def policy_tables(comparison: comparison_model.Comparison, policy: str) -> tuple
     return (
         latency_quality_table(comparison, policy),
         *(
-            contrasts_table(comparison, contrasts_by_key(comparison, policy, key), title)
+            tables.contrasts_table(comparison, contrasts_by_key(comparison, policy, key), title)
             for key, title in (
                 (AGAINST_FIRST, f"{policy}: against {comparison.group(policy)[0].label}"),
                 (STEP, f"{policy}: step by step"),
@@ -278,7 +275,7 @@ def document_of(
     comparison: comparison_model.Comparison, runs: Mapping[str, LoadedRun], folder: Path
 ) -> Document:
     """Return the document of a latency sweep."""
-    return comparison_document(
+    return build.comparison_document(
         comparison,
         runs,
         folder,
@@ -291,5 +288,5 @@ def document_of(
                 for policy in comparison.groups
             ),
         ],
-        facts=(*plain_facts(comparison), *common_rules(comparison)),
+        facts=(*tables.plain_facts(comparison), *tables.common_rules(comparison)),
     )

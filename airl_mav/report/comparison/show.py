@@ -14,7 +14,7 @@ from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report import run_verdict
+from airl_mav.report import heatmap, measures, run_figures, run_verdict
 from airl_mav.report.comparison import (
     compare_levels_page,
     comparison_model,
@@ -42,9 +42,6 @@ from airl_mav.report.document import (
     print_place,
     write_document,
 )
-from airl_mav.report.heatmap import Field, HeatMap, heat_picture
-from airl_mav.report.measures import MEASURES, SUCCESS_RATE, QualityMeasure
-from airl_mav.report.run_figures import flight_pictures
 
 Runs = Mapping[str, LoadedRun]
 
@@ -254,7 +251,7 @@ def runs_document(comparison: Comparison, runs: Mapping[str, LoadedRun], folder:
         ),
         Section(
             "Flights from above",
-            draw=lambda: flight_pictures(
+            draw=lambda: run_figures.flight_pictures(
                 "compare-flights", figures.flight_panels(comparison.runs, runs)
             ),
             sheet="compare-trajectories.png",
@@ -331,7 +328,7 @@ def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
     arenas = list(dict.fromkeys(run.entry.group for run in runs))
     at = {(run.label, run.entry.group): run for run in runs}
     views = []
-    for measure in MEASURES:
+    for measure in measures.MEASURES:
         columns = (
             Column("policy", number=False),
             *(Column(arena, measure.unit) for arena in arenas),
@@ -345,7 +342,7 @@ def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
     return views
 
 
-def _cell(run: ComparedRun | None, measure: QualityMeasure) -> str:
+def _cell(run: ComparedRun | None, measure: measures.QualityMeasure) -> str:
     if run is None:
         return NONE
     text = measure.with_interval(run.quality)
@@ -357,8 +354,8 @@ def trained_here(run: ComparedRun) -> bool:
     return run.entry.group == run.entry.trained_in
 
 
-def _notes(runs: Sequence[ComparedRun], measure: QualityMeasure) -> tuple[str, ...]:
-    if measure is not SUCCESS_RATE:
+def _notes(runs: Sequence[ComparedRun], measure: measures.QualityMeasure) -> tuple[str, ...]:
+    if measure is not measures.SUCCESS_RATE:
         return ("Means over the flights that reached the goal, 95 % bootstrap intervals.",)
     notes = ["Of all flights; 95 % intervals after Wilson. The same seeds in every cell."]
     if any(trained_here(run) for run in runs):
@@ -368,17 +365,17 @@ def _notes(runs: Sequence[ComparedRun], measure: QualityMeasure) -> tuple[str, .
     return (*notes, f"{start}: {'; '.join(rules)}.")
 
 
-def success_map(runs: Sequence[ComparedRun]) -> HeatMap:
+def success_map(runs: Sequence[ComparedRun]) -> heatmap.HeatMap:
     """Return the success rates as a heat map with the first policy at the top."""
     policies = list(dict.fromkeys(run.label for run in runs))[::-1]
-    return HeatMap(
+    return heatmap.HeatMap(
         title="success; a star: trained there",
         rows=policies,
         row_title="",
         columns=list(dict.fromkeys(run.entry.group for run in runs)),
         column_title="",
         fields={
-            (run.label, run.entry.group): Field(
+            (run.label, run.entry.group): heatmap.Field(
                 100.0 * rate, f"{100.0 * rate:.1f}{'*' if trained_here(run) else ''}"
             )
             for run in runs
@@ -403,7 +400,7 @@ def matrix_document(
             *(Section(view.title, tables=(view,)) for view in matrix_tables(comparison.runs)),
             Section(
                 "Success at a glance",
-                draw=lambda: [heat_picture("matrix", alt, success_map(comparison.runs))],
+                draw=lambda: [heatmap.heat_picture("matrix", alt, success_map(comparison.runs))],
                 in_terminal=False,
             ),
         ],

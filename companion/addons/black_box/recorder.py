@@ -21,16 +21,12 @@ from pydantic import TypeAdapter
 from airl_mav.black_box import messages
 from airl_mav.black_box.mcap_file import BlackBoxFile
 from airl_mav.black_box.messages import encoded
+from airl_mav.core import constants, errors, frames, machine
 from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import FieldError
-from airl_mav.core.frames import Goal, goal_distance_m
-from airl_mav.core.machine import describe_machine, git_state, package_versions, temperature_c
 from airl_mav.flight.episode_record import Setup
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.observation import Kinematics
-from companion.link_interface import BatteryState, VehicleStatus
-from companion.pilot import OLDEST_FRAME_US, SentDecision
+from companion import link_interface, pilot
 
 if TYPE_CHECKING:
     from airl_mav.scenario.stand_alone import StandAloneCompanion
@@ -39,13 +35,13 @@ if TYPE_CHECKING:
 
 _SETUP = TypeAdapter(Setup)
 
-SAMPLE_US = US_PER_S // 25
+SAMPLE_US = constants.US_PER_S // 25
 """Interval of telemetry samples [µs]; the flight controller sends 50 per second."""
 
-STATUS_US = US_PER_S // 2
+STATUS_US = constants.US_PER_S // 2
 """Interval of status, battery and resources [µs]."""
 
-SYNC_US = US_PER_S // 4
+SYNC_US = constants.US_PER_S // 4
 """Interval of syncs to disk [µs]; a crash loses at most this time plus one sample."""
 
 
@@ -55,10 +51,10 @@ class RecordedLink(Protocol):
     def kinematics(self) -> Kinematics:
         """Return the newest telemetry."""
 
-    def status(self) -> VehicleStatus:
+    def status(self) -> link_interface.VehicleStatus:
         """Return armed state, flight mode and charge."""
 
-    def battery(self) -> BatteryState:
+    def battery(self) -> link_interface.BatteryState:
         """Return the newest state of the battery."""
 
 
@@ -70,7 +66,7 @@ class BlackBoxRecorder:
         file: BlackBoxFile,
         link: RecordedLink,
         clock: Clock,
-        goal: Goal,
+        goal: frames.Goal,
         images_hz: float,
     ) -> None:
         """Record to a new file, with at most `images_hz` images of decisions per second [Hz]."""
@@ -78,11 +74,11 @@ class BlackBoxRecorder:
         """Reason for an early end of the file; None = no failure."""
         self._file, self._link, self._clock, self._goal = file, link, clock, goal
         # 0 disables images: they would be due at infinity.
-        self._image_us = math.inf if images_hz == 0.0 else US_PER_S / images_hz
+        self._image_us = math.inf if images_hz == 0.0 else constants.US_PER_S / images_hz
         self._next_image_us = -math.inf
         self._unix_us = utc_us() - clock.time_us()
         """Calendar time at the clock's zero [µs since 1970], constant during the flight."""
-        self._told: deque[SentDecision | tuple[messages.Message, int]] = deque()
+        self._told: deque[pilot.SentDecision | tuple[messages.Message, int]] = deque()
         self._next_status_us = self._next_sync_us = 0
         self._process = psutil.Process()
         self._used_us, self._used_at_us = processor_time_us(), clock.time_us()
@@ -94,7 +90,7 @@ class BlackBoxRecorder:
         """Start a thread that calls `record` at the sample interval."""
         self._thread.start()
 
-    def decided(self, decided: SentDecision) -> None:
+    def decided(self, decided: pilot.SentDecision) -> None:
         """Queue a decision without blocking."""
         self._told.append(decided)
 
@@ -155,7 +151,7 @@ class BlackBoxRecorder:
         # popleft is atomic: the pilot's thread appends at the same time.
         while self._told:
             told = self._told.popleft()
-            if isinstance(told, SentDecision):
+            if isinstance(told, pilot.SentDecision):
                 self._write_decision(told)
             else:
                 self._write(*told)
@@ -173,14 +169,14 @@ class BlackBoxRecorder:
     def _write(self, message: messages.Message, now_us: int) -> None:
         self._file.write(message, self._unix_us + now_us)
 
-    def _write_decision(self, told: SentDecision) -> None:
+    def _write_decision(self, told: pilot.SentDecision) -> None:
         frame = told.seen.frame
         age_us = told.started_us - frame.capture_time_us
         position, velocity, quaternion = _numbers(told.state)
-        (away_m,) = _finite([goal_distance_m(self._goal, told.state.position)])
+        (away_m,) = _finite([frames.goal_distance_m(self._goal, told.state.position)])
         decision = messages.Decision(
             # Stamps of another clock do not give an image's age.
-            frame.capture_time_us if 0 <= age_us <= OLDEST_FRAME_US else NO_STAMP,
+            frame.capture_time_us if 0 <= age_us <= pilot.OLDEST_FRAME_US else NO_STAMP,
             told.seen.received_us,
             told.started_us,
             told.ready_us,
@@ -217,7 +213,7 @@ class BlackBoxRecorder:
             used_us / passed_us if passed_us > 0 else 0.0,
             psutil.cpu_percent(),
             self._process.memory_info().rss,
-            temperature_c(),
+            machine.temperature_c(),
         )
 
 
@@ -241,7 +237,7 @@ def open_recorder(
     run: Mapping[str, Any],
     link: RecordedLink,
     clock: Clock,
-    goal: Goal,
+    goal: frames.Goal,
 ) -> BlackBoxRecorder:
     """Return the recorder of a mission with a new file in a folder, or raise FieldError."""
     now = utc_now()
@@ -249,9 +245,9 @@ def open_recorder(
         "name": "flight",
         "created_utc": now.isoformat(timespec="seconds"),
         "seeds": [run["config"]["seed"]],
-        "versions": package_versions(),
-        "machine": describe_machine(),
-        "git": git_state(),
+        "versions": machine.package_versions(),
+        "machine": machine.describe_machine(),
+        "git": machine.git_state(),
     }
     try:
         # The file is created and synced before take-off: an unwritable folder must fail on the
@@ -260,7 +256,7 @@ def open_recorder(
         file = BlackBoxFile(folder / f"{now:%Y%m%dT%H%M%S.%fZ}{messages.SUFFIX}", {**run, **made})
         file.sync()
     except OSError as error:
-        raise FieldError("black_box", f"{folder}", problem=f"{error.strerror}") from None
+        raise errors.FieldError("black_box", f"{folder}", problem=f"{error.strerror}") from None
     return BlackBoxRecorder(file, link, clock, goal, run["config"]["black_box_images_hz"])
 
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MAX_MM
-from airl_mav.camera.intrinsics import Intrinsics, finer
+from airl_mav.camera import frame, intrinsics
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.images import nearest_returns
 from airl_mav.profiles.projections import Distortion, distorted, sees_to, undistorted
@@ -59,7 +58,7 @@ class Lens:
         return _in_words(*(_half_rad(side, self.distortion) for side in sides))
 
     @classmethod
-    def of(cls, k: Intrinsics) -> Lens:
+    def of(cls, k: intrinsics.Intrinsics) -> Lens:
         """Return the lens of a profile's camera, a pinhole or a fisheye."""
         bent = k.distortion if k.model.radial else None
         return cls(k.width, k.height, k.focal, k.focal, k.cx, k.cy, bent)
@@ -68,7 +67,7 @@ class Lens:
 class Fitting:
     """Conversion of images between two cameras with the same orientation."""
 
-    def __init__(self, lens: Lens, wanted: Intrinsics) -> None:
+    def __init__(self, lens: Lens, wanted: intrinsics.Intrinsics) -> None:
         """Look up each pixel of the target camera in the images of the lens."""
         self.wanted = wanted
         """Target camera of the images returned by `fit`."""
@@ -93,7 +92,7 @@ class Fitting:
             """Share of the target image seen by the lens, 0 to 1."""
             return
         # Otherwise every sample ray is looked up in both dimensions.
-        rays = finer(wanted, points).rays
+        rays = intrinsics.finer(wanted, points).rays
         row, column = _looked_up(lens, rays)
         inside = (row >= 0) & (row < lens.height) & (column >= 0) & (column < lens.width)
         # Indices outside are replaced by 0 and masked by `_unseen`.
@@ -116,7 +115,7 @@ class Fitting:
         seen = depth_mm[self._rows, self._columns]
         seen[self._unseen] = 0
         if self._deeper is not None:
-            seen = np.minimum(np.rint(seen * self._deeper), MAX_MM).astype(np.uint16)
+            seen = np.minimum(np.rint(seen * self._deeper), frame.MAX_MM).astype(np.uint16)
         # Values of nearest_returns are one less; "no return" wraps around to 0.
         nearest = nearest_returns(seen[None], self.wanted.height, self.wanted.width)
         fitted: NDArray[np.uint16] = nearest[0] + np.uint16(1)
@@ -157,7 +156,7 @@ def _in_words(half_wide_rad: float, half_high_rad: float) -> str:
     return f"{wide:.0f} x {high:.0f} deg"
 
 
-def _seen_by(k: Intrinsics) -> str:
+def _seen_by(k: intrinsics.Intrinsics) -> str:
     """Return the field of view of a profile's camera, as text."""
     bent = k.distortion if k.model.radial else None
     return _in_words(0.5 * k.horizontal_fov_rad, _half_rad(0.5 * k.height / k.focal, bent))

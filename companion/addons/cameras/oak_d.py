@@ -15,10 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from airl_mav.core.clock import Clock
-from airl_mav.core.errors import FieldError
-from companion.addons.cameras.drivers import FAILED_S, DepthImage, Silence, plausible_age_us
-from companion.addons.cameras.fitting import Lens
+from airl_mav.core import clock, errors
+from companion.addons.cameras import drivers, fitting
 
 # On import, depthai's crash reporter handles signals, including SIGXFSZ: at a file size limit of a
 # log, the companion would end in flight instead of continuing without the log.
@@ -52,25 +50,25 @@ class OakD:
         `now` is the monotonic host time of depthai's stamps. Raises FieldError without an image, or
         if the first image lacks intrinsics or is not a depth image.
         """
-        self._pipeline, self._silence = pipeline, Silence()
+        self._pipeline, self._silence = pipeline, drivers.Silence()
         self._now: Callable[..., timedelta] = dai.Clock.now if now is None else now
         # A queue of one frame without blocking: only the newest image counts.
         self._queue = depth.createOutputQueue(maxSize=1, blocking=False)
         self._pipeline.start()
         # The first image reports the rectified lens; it is also the first result of `read`.
         try:
-            first = self._taken(FAILED_S)
+            first = self._taken(drivers.FAILED_S)
             if first is None:
-                raise ValueError(f"no image for {FAILED_S:g} s")
+                raise ValueError(f"no image for {drivers.FAILED_S:g} s")
             self.lens = _lens_of(first)
             """Lens of the rectified images, from the calibration stored on the device."""
             _checked(first)
         except (RuntimeError, ValueError) as error:
             self.close()
-            raise FieldError("camera", name, problem=" ".join(str(error).split())) from None
+            raise errors.FieldError("camera", name, problem=" ".join(str(error).split())) from None
         self._first: Any | None = first
 
-    def read(self, timeout_s: float) -> DepthImage | None:
+    def read(self, timeout_s: float) -> drivers.DepthImage | None:
         """Wait for the next image; RuntimeError after 5 s or disconnection, else ValueError."""
         frame, self._first = self._first, None
         if frame is None:
@@ -81,9 +79,9 @@ class OakD:
         self._silence.broken()
         # Middle of the exposure, computed by depthai from the readout stamp.
         taken = frame.getTimestamp(dai.CameraExposureOffset.MIDDLE)
-        return DepthImage(
+        return drivers.DepthImage(
             _checked(frame),
-            plausible_age_us((self._now() - taken) // _US),
+            drivers.plausible_age_us((self._now() - taken) // _US),
             # Sequence numbers count captured images, so gaps show drops.
             frame.getSequenceNum(),
         )
@@ -102,7 +100,7 @@ class OakD:
             raise RuntimeError("the connection is closed") from None
 
 
-def _lens_of(frame: Any) -> Lens:
+def _lens_of(frame: Any) -> fitting.Lens:
     """Return the lens of an image, as used by depthai's point-cloud nodes, or raise ValueError."""
     about = frame.getTransformation()
     # Without a factory calibration the intrinsics are invalid, and so are distances.
@@ -112,7 +110,7 @@ def _lens_of(frame: Any) -> Lens:
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0.0):
         raise ValueError(f"focal lengths {fx:g} and {fy:g} px, which is no pinhole")
     width, height = about.getSize()
-    return Lens(width, height, fx, fy, cx, cy)
+    return fitting.Lens(width, height, fx, fy, cx, cy)
 
 
 def _checked(frame: Any) -> Any:
@@ -123,7 +121,7 @@ def _checked(frame: Any) -> Any:
     return np.array(frame.getFrame(), np.uint16)
 
 
-def open_oak_d(which: str, _clock: Clock) -> OakD:
+def open_oak_d(which: str, _clock: clock.Clock) -> OakD:
     """Open a camera and start the stereo matching, or raise FieldError.
 
     `which` is "" for the first camera, a device id listed by `depthai`, or a network address (PoE),
@@ -134,15 +132,15 @@ def open_oak_d(which: str, _clock: Clock) -> OakD:
     # A network camera (PoE) need not answer the discovery.
     if not _is_address(which):
         if not found:
-            raise FieldError("camera", name, problem="depthai finds no camera")
+            raise errors.FieldError("camera", name, problem="depthai finds no camera")
         if which and which not in found:
-            raise FieldError("camera", name, f"oak-d:{' or oak-d:'.join(found)}")
+            raise errors.FieldError("camera", name, f"oak-d:{' or oak-d:'.join(found)}")
     try:
         device = dai.Device(dai.DeviceInfo(which)) if which else dai.Device()
         pipeline = dai.Pipeline(device)
         depth = _matching(pipeline)
     except RuntimeError as error:
-        raise FieldError("camera", name, problem=" ".join(str(error).split())) from None
+        raise errors.FieldError("camera", name, problem=" ".join(str(error).split())) from None
     return OakD(name, pipeline, depth)
 
 

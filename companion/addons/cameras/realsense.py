@@ -13,8 +13,7 @@ from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import Clock, utc_us
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from companion.addons.cameras.drivers import DepthImage, Silence, plausible_age_us
-from companion.addons.cameras.fitting import Lens
+from companion.addons.cameras import drivers, fitting
 
 RATE_HZ = 30
 WIDTH_PX = 848
@@ -33,15 +32,15 @@ class RealSense:
         self._device, self._utc_now_us = device, utc_now_us
         self._sensor, profile = _depth_stream(device)
         k = profile.as_video_stream_profile().intrinsics
-        self.lens = Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
+        self.lens = fitting.Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
         """Lens of the depth stream, which librealsense delivers rectified."""
         # A queue of one keeps the newest frame.
         self._queue = rs.frame_queue(1)
-        self._silence = Silence()
+        self._silence = drivers.Silence()
         self._sensor.open(profile)
         self._sensor.start(self._queue)
 
-    def read(self, timeout_s: float) -> DepthImage | None:
+    def read(self, timeout_s: float) -> drivers.DepthImage | None:
         """Wait for the next image; RuntimeError after 5 s: unplugged, or end of a recording."""
         arrived, frame = self._queue.try_wait_for_frame(int(timeout_s * US_PER_S / US_PER_MS))
         if not arrived:
@@ -55,7 +54,7 @@ class RealSense:
         # Depth units differ between models; 1 mm is the common case and needs no scaling.
         if abs(unit_mm - 1.0) > 1e-6:
             image = np.clip(np.rint(image * unit_mm), 0, MAX_MM).astype(np.uint16)
-        return DepthImage(image, self._age_us(depth), depth.get_frame_number())
+        return drivers.DepthImage(image, self._age_us(depth), depth.get_frame_number())
 
     def close(self) -> None:
         """Stop the stream."""
@@ -66,7 +65,7 @@ class RealSense:
         """Return the age of an image [µs]; 0 for stamps of the camera's clock."""
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0
-        return plausible_age_us(self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS))
+        return drivers.plausible_age_us(self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS))
 
 
 def open_realsense(which: str, _clock: Clock) -> RealSense:

@@ -16,8 +16,7 @@ from airl_mav.core.clock import NS_PER_US, Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.projections import MOST_COEFFICIENT, Distortion
-from companion.addons.cameras.drivers import DepthImage, plausible_age_us
-from companion.addons.cameras.fitting import Lens
+from companion.addons.cameras import drivers, fitting
 
 
 class RosBag:
@@ -72,7 +71,7 @@ class RosBag:
             # Colour images use the same message type; the encoding distinguishes them.
             return False
 
-    def _described(self, name: str) -> Lens:
+    def _described(self, name: str) -> fitting.Lens:
         described = info_topic(self._topic)
         kinds = {each.topic: each.msgtype for each in self._bag.connections}
         if kinds.get(described) != CAMERA_INFO:
@@ -90,7 +89,7 @@ class RosBag:
         for connection, time_ns, data in self._bag.messages(connections=which):
             yield time_ns // NS_PER_US, self._bag.deserialize(data, connection.msgtype)
 
-    def read(self, timeout_s: float) -> DepthImage | None:
+    def read(self, timeout_s: float) -> drivers.DepthImage | None:
         """Wait until the next image is due; RuntimeError at the end, ValueError without depth."""
         if self._next is None:
             self._next = next(self._told, None)
@@ -107,7 +106,7 @@ class RosBag:
         if due_us > until_us:
             return None
         self._next = None
-        return DepthImage(depth_mm(message), age_us(message, arrived_us))
+        return drivers.DepthImage(depth_mm(message), age_us(message, arrived_us))
 
     def close(self) -> None:
         """Close the recording."""
@@ -169,7 +168,7 @@ def stamped_us(message: Any) -> int:
 
 def age_us(message: Any, now_us: int) -> int:
     """Return the age of an image [µs] at a time since 1970 [µs]; 0 for another clock's stamp."""
-    return plausible_age_us(now_us - stamped_us(message))
+    return drivers.plausible_age_us(now_us - stamped_us(message))
 
 
 EQUIDISTANT = "equidistant"
@@ -179,7 +178,7 @@ RECTIFIED = "rect"
 """Mark of rectified images in the last part of a topic name, as used by ROS's image_proc."""
 
 
-def lens_of(message: Any, image_topic: str = "") -> Lens:
+def lens_of(message: Any, image_topic: str = "") -> fitting.Lens:
     """Return the lens described by a sensor_msgs/CameraInfo, or raise ValueError.
 
     Without distortion, K describes the camera. With distortion, P describes the rectified images
@@ -206,7 +205,7 @@ def lens_of(message: Any, image_topic: str = "") -> Lens:
     )
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0.0 and message.width):
         raise ValueError(f"a camera of focal lengths {fx:g} and {fy:g} px, which is no pinhole")
-    return Lens(message.width, message.height, fx, fy, cx, cy, coefficients)
+    return fitting.Lens(message.width, message.height, fx, fy, cx, cy, coefficients)
 
 
 def _coefficients(message: Any) -> Distortion:

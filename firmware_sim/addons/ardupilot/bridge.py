@@ -14,9 +14,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import LOOPBACK, US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core import clock, constants, errors
 from firmware_sim import interfaces
 from firmware_sim.addons.ardupilot.program import (
     OBSERVER_PORT,
@@ -27,9 +25,8 @@ from firmware_sim.addons.ardupilot.program import (
     find_arducopter,
     start,
 )
-from firmware_sim.external.flight_stack import FirmwareRequest, instance_endpoint
+from firmware_sim.external import flight_stack, parameters
 from firmware_sim.external.launcher import Launcher, WorkingFolders, no_process
-from firmware_sim.external.parameters import refuse_untold
 from firmware_sim.mavlink.endpoint import Address, Endpoint
 
 MAGIC_16, MAGIC_32 = 18_458, 29_569
@@ -80,7 +77,7 @@ def state_line(time_us: int, sample: interfaces.SensorSample, truth: interfaces.
     reads back as the same double. ArduPilot simulates GPS, barometer and compass from `truth`.
     """
     return (
-        f'\n{{"timestamp":{time_us * AWAY_FROM_ZERO / US_PER_S!r},'
+        f'\n{{"timestamp":{time_us * AWAY_FROM_ZERO / constants.US_PER_S!r},'
         f'"imu":{{"gyro":{sample.gyro.tolist()},"accel_body":{sample.accel.tolist()}}},'
         f'"position":{truth.position.tolist()},'
         f'"quaternion":{truth.quaternion.tolist()},'
@@ -129,7 +126,7 @@ class ArdupilotBridge:
         """Number of datagrams that were not servo packets."""
         self._run = 0
         """Number of consecutive invalid datagrams."""
-        self._silence_us = int(silence_s * US_PER_S)
+        self._silence_us = int(silence_s * constants.US_PER_S)
         self._alive: Callable[[], None] = no_process
         self._truth: Callable[[], interfaces.TrueState] | None = None
         self._address: Address | None = None
@@ -144,11 +141,11 @@ class ArdupilotBridge:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(_SLICE_S)
         try:
-            self._socket.bind((LOOPBACK, port))
+            self._socket.bind((constants.LOOPBACK, port))
         except OSError as error:
             self._socket.close()
-            raise UsageError(
-                f"--instance: UDP port {port} of {LOOPBACK} cannot be bound "
+            raise errors.UsageError(
+                f"--instance: UDP port {port} of {constants.LOOPBACK} cannot be bound "
                 f"({error.strerror}): another simulator? Choose another instance (its port is "
                 f"{SIMULATOR_PORT} + {PORTS_PER_INSTANCE} x instance)"
             ) from error
@@ -156,10 +153,10 @@ class ArdupilotBridge:
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Wait for the first servo packet, see `Bridge`; FirmwareMissingError for a bad rate."""
         self._alive = alive
-        stopwatch = WallClock()
+        stopwatch = clock.WallClock()
         while self._packet is None:
             alive()
-            if stopwatch.time_us() > timeout_s * US_PER_S:
+            if stopwatch.time_us() > timeout_s * constants.US_PER_S:
                 raise interfaces.FirmwareMissingError(self._not_connected(timeout_s))
             self._packet = self._receive()
         self.rate_hz = self._packet.frame_rate_hz
@@ -184,7 +181,7 @@ class ArdupilotBridge:
             raise RuntimeError("step() before wait_connected() and use_truth()")
         if self._base_us is None:
             # ArduPilot's time starts at 0 and must also advance with the first line.
-            self._base_us = sample.time_us - US_PER_S // self.rate_hz
+            self._base_us = sample.time_us - constants.US_PER_S // self.rate_hz
         self.time_us = sample.time_us - self._base_us
         answered = self._newest(answered)
         line = state_line(self.time_us, sample, truth())
@@ -211,7 +208,7 @@ class ArdupilotBridge:
             self._socket.settimeout(_SLICE_S)
 
     def _next(self, answered: ServoPacket, line: bytes) -> ServoPacket:
-        stopwatch = WallClock()
+        stopwatch = clock.WallClock()
         repeated = False
         while True:
             packet = self._receive()
@@ -222,11 +219,12 @@ class ArdupilotBridge:
                 continue
             silent_us = stopwatch.time_us()
             self._alive()
-            if self._newcomer and silent_us >= NEWCOMER_S * US_PER_S:
+            if self._newcomer and silent_us >= NEWCOMER_S * constants.US_PER_S:
                 raise interfaces.FirmwareLostError(_RESTARTED)
             if silent_us >= self._silence_us:
                 raise interfaces.FirmwareLostError(
-                    f"ArduPilot has sent no servo packet for {self._silence_us / US_PER_S:g} s"
+                    "ArduPilot has sent no servo packet for "
+                    f"{self._silence_us / constants.US_PER_S:g} s"
                 )
             if repeated and self._address is not None:
                 # A repeated packet without a newer one means that the line was lost.
@@ -267,8 +265,8 @@ class ArdupilotBridge:
         if self._veteran:
             heard = ", only one that has flown before: restart it for each flight"
         return (
-            f"no ArduPilot on UDP port {self.port} of {LOOPBACK} in {timeout_s:g} s{heard}: start "
-            f"it with --model JSON:{LOOPBACK} --sim-port-out {self.port}"
+            f"no ArduPilot on UDP port {self.port} of {constants.LOOPBACK} in {timeout_s:g} s"
+            f"{heard}: start it with --model JSON:{constants.LOOPBACK} --sim-port-out {self.port}"
         )
 
 
@@ -288,15 +286,15 @@ def _motors(pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
     return a, b, c, d
 
 
-def ardupilot_parts(request: FirmwareRequest) -> tuple[Launcher, Endpoint]:
+def ardupilot_parts(request: flight_stack.FirmwareRequest) -> tuple[Launcher, Endpoint]:
     """Bind the observer's port. Return ArduPilot's launcher and this endpoint."""
     options, ports, vehicle = request.aircraft.real, request.aircraft.ports, request.vehicle
     instance, folder = options.instance, options.ardupilot_dir
     airframe = ardupilot_airframe(vehicle)
-    refuse_untold(vehicle, "ardupilot")
+    parameters.refuse_untold(vehicle, "ardupilot")
     program = None if folder is None else find_arducopter(folder)
     # A program started here accepts any port.
-    endpoint = instance_endpoint(OBSERVER_PORT + instance if program is None else 0)
+    endpoint = flight_stack.instance_endpoint(OBSERVER_PORT + instance if program is None else 0)
     links = Links(ports.api_port, ports.gcs_port, endpoint.local[1])
     launcher = Launcher(
         airframe,

@@ -8,13 +8,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.frames import HOME
+from airl_mav.core import constants, frames
 from airl_mav.profiles.vehicle import CORNERS, Corner, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
-from firmware_sim.external.launcher import StartCommand
-from firmware_sim.external.parameters import RequiredAirframe, Value, no_table
-from firmware_sim.external.programs import FirmwareKind
+from firmware_sim.external import launcher, parameters, programs
 from firmware_sim.interfaces import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
@@ -63,26 +60,26 @@ def simulator_port(instance: int) -> int:
 
 def command(program: str, instance: int, links: Links, defaults: str) -> list[str]:
     """Return program and arguments; `instance` shifts the port, `defaults` is a relative file."""
-    home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
+    home = f"{frames.HOME.latitude_deg},{frames.HOME.longitude_deg},{frames.HOME.altitude_m},0"
     return [
         program,
-        *("--model", f"JSON:{LOOPBACK}", "--sim-port-out", str(simulator_port(instance))),
+        *("--model", f"JSON:{constants.LOOPBACK}", "--sim-port-out", str(simulator_port(instance))),
         *(f"-I{instance}", "--wipe", "--speedup", "1", "--home", home, "--defaults", defaults),
-        *("--serial0", f"udpclient:{LOOPBACK}:{links.api}"),
-        *("--serial1", f"udpclient:{LOOPBACK}:{links.gcs}"),
-        *("--serial2", f"udpclient:{LOOPBACK}:{links.observer}"),
+        *("--serial0", f"udpclient:{constants.LOOPBACK}:{links.api}"),
+        *("--serial1", f"udpclient:{constants.LOOPBACK}:{links.gcs}"),
+        *("--serial2", f"udpclient:{constants.LOOPBACK}:{links.observer}"),
     ]
 
 
 def start(
     program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
-) -> StartCommand:
+) -> launcher.StartCommand:
     """Write the parameter file to the working folder; return the start command."""
     (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
-    return StartCommand(command(str(program), instance, links, PARAMETERS), {})
+    return launcher.StartCommand(command(str(program), instance, links, PARAMETERS), {})
 
 
-def ardupilot_file(settings: Mapping[str, Value]) -> str:
+def ardupilot_file(settings: Mapping[str, parameters.Value]) -> str:
     """Return a file in ArduPilot's format: `--defaults` of its SITL, Mission Planner, MAVProxy."""
     return "".join(f"{name} {value:g}\n" for name, value in settings.items())
 
@@ -94,13 +91,13 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 """Corner of each motor of ArduCopter's quad X: AP_MotorsMatrix, MOTOR_FRAME_TYPE_X."""
 
 
-def ardupilot_airframe(vehicle: VehicleProfile) -> RequiredAirframe:
+def ardupilot_airframe(vehicle: VehicleProfile) -> parameters.RequiredAirframe:
     """Return a quad by ArduCopter's frame class, type and outputs; else FirmwareMissingError."""
     copter = vehicle.ardupilot
     if copter is None:
-        raise no_table("ardupilot")
+        raise parameters.no_table("ardupilot")
     kind = {"FRAME_CLASS": copter.frame_class, "FRAME_TYPE": copter.frame_type}
-    return RequiredAirframe(
+    return parameters.RequiredAirframe(
         "ArduPilot",
         copter.motors,
         frame={
@@ -113,7 +110,7 @@ def ardupilot_airframe(vehicle: VehicleProfile) -> RequiredAirframe:
 
 
 def _ardupilot_problem(
-    motors: Sequence[Corner], kind: Mapping[str, int], held: Mapping[str, Value]
+    motors: Sequence[Corner], kind: Mapping[str, int], held: Mapping[str, parameters.Value]
 ) -> str | None:
     for name, expected in kind.items():
         if held[name] != expected:
@@ -147,7 +144,7 @@ def _how_to_start(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None:
     return f"airl parameters ardupilot {file} && {start}"
 
 
-ARDUPILOT = FirmwareKind(
+ARDUPILOT = programs.FirmwareKind(
     airframe=ardupilot_airframe,
     parameter_file=ardupilot_file,
     parts="firmware_sim.addons.ardupilot.bridge:ardupilot_parts",

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, frames
 from firmware_sim.addons.auxiliary_estimation.external_vision import Control, ExternalVision
 from firmware_sim.addons.auxiliary_estimation.optical_flow import OpticalFlowFusion
 from firmware_sim.addons.auxiliary_estimation.range_finder import Aids, RangeFinder
@@ -18,7 +17,7 @@ from firmware_sim.autopilot.error_state import KernelFilter, Measurement
 from firmware_sim.autopilot.estimator import Aiding, Estimator
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, Received, SensorSample
 
-_JUDGED_EVERY_US = US_PER_S // 10
+_JUDGED_EVERY_US = constants.US_PER_S // 10
 """Interval of velocity checks by `Consistency`, the sample period of a typical GPS [µs]."""
 
 _GROUND_STEPS, _GROUND_STEP_US = 30, 50_000
@@ -54,7 +53,7 @@ class AuxiliaryAids(Aiding):
         aids = Aids(horizontal=True, vertical_speed=True, height_us=0)
         for step in range(1, 2 * _GROUND_STEPS):
             now_us = step * _GROUND_STEP_US
-            terrain.predict(state, np.zeros(3), np.array([0.0, 0.0, -GRAVITY_M_S2]))
+            terrain.predict(state, np.zeros(3), np.array([0.0, 0.0, -constants.GRAVITY_M_S2]))
             finder.take(DistanceReading(0.5, 0.1, 12.0), now_us, CLIENTS_SENSOR)
             finder.step(now_us, lambda: aids, flying=step > _GROUND_STEPS)
 
@@ -190,7 +189,7 @@ class AuxiliaryAids(Aiding):
             height_us=max(m.fused_us or 0 for m in told),
         )
 
-    def _judge(self, innovation: Vector, variance: Vector) -> float:
+    def _judge(self, innovation: frames.Vector, variance: frames.Vector) -> float:
         """Check a velocity of external vision against the inertial sensors, at GPS's rate."""
         estimator, now_us = self._estimator, self._estimator.time_us
         # GPS velocities are checked by the estimator; vision replaces them only without GPS.

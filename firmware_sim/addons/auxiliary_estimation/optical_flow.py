@@ -16,9 +16,7 @@ import numpy as np
 
 from airl_mav.core.constants import MS_PER_S, TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, quat_to_matrix
-from firmware_sim.addons.auxiliary_estimation import sensors
-from firmware_sim.addons.auxiliary_estimation.range_finder import RangeFinder
-from firmware_sim.addons.auxiliary_estimation.terrain_filter import GROUND, reset_variances
+from firmware_sim.addons.auxiliary_estimation import range_finder, sensors, terrain_filter
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.interfaces import FlowReading
@@ -62,7 +60,7 @@ class OpticalFlowFusion:
         self,
         value: Callable[[str], float],
         state: Vector,
-        ground: RangeFinder,
+        ground: range_finder.RangeFinder,
         fuse: Callable[[Measurement], bool],
     ) -> None:
         """Start without measurements.
@@ -346,7 +344,7 @@ class OpticalFlowFusion:
         state[es.V : es.V + 2] = level
         # A flow error of s [rad/s] is a velocity error of s times range.
         spread = self._range_m**2 * variance
-        reset_variances(self._terrain, {es.VEL: spread, es.VEL + 1: spread})
+        terrain_filter.reset_variances(self._terrain, {es.VEL: spread, es.VEL + 1: spread})
         self._agree(now_us)
 
     def _put_ground(self, now_us: int) -> None:
@@ -410,5 +408,5 @@ def flow_by_errors(rotation: Vector, velocity: Vector, height_m: float) -> Vecto
         # Flow falls with height: d(v / h) / dh = -v / h².
         by_height = -sign * scale * body[seen] / height_m
         # The height above ground is terrain z minus vehicle z.
-        row[es.POS + 2], row[GROUND] = -by_height, by_height
+        row[es.POS + 2], row[terrain_filter.GROUND] = -by_height, by_height
     return jacobian

@@ -18,9 +18,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import rotate
 from firmware_sim.addons.auxiliary_estimation.terrain_filter import TerrainFilter, reset_variances
+from firmware_sim.autopilot import autopilot_state, error_state
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot_state import Clearance
-from firmware_sim.autopilot.error_state import Measurement
 from firmware_sim.interfaces import DOWNWARD, DistanceReading
 
 HEIGHT_BY_RANGE = 2
@@ -138,11 +137,11 @@ class RangeFinder:
         terrain.walk_m_s = value("EKF2_TERR_NOISE") if free else 0.0
         terrain.slope = value("EKF2_TERR_GRAD")
 
-    def clearance(self) -> Clearance:
+    def clearance(self) -> autopilot_state.Clearance:
         """Return the height above ground."""
         # The filtered ratio is a square with a sign.
         ratio = math.sqrt(abs(self._filtered_ratio)) if self.tells_ground else math.nan
-        return Clearance(
+        return autopilot_state.Clearance(
             max(self._clearance_m, 0.0),
             self._valid,
             self.terrain.variance,
@@ -164,7 +163,7 @@ class RangeFinder:
         """Return whether a range has updated the height since then [µs]."""
         return self.tells_height and self.fused_us is not None and self.fused_us >= since_us
 
-    def correct(self, baro: Measurement, now_us: int) -> None:
+    def correct(self, baro: error_state.Measurement, now_us: int) -> None:
         """Correct the offset of a long-rejected barometer if the ground is the reference.
 
         Source: PX4 1.16, EKF/aid_sources/barometer, which stops it and restarts with a new bias.

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, frames
+from firmware_sim import interfaces, sensor_table
 from firmware_sim.autopilot.snapshot import AutopilotState
-from firmware_sim.interfaces import DistanceReading, FlowReading, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.streams import units
-from firmware_sim.sensor_table import Sensor, SensorStream, SensorTopic, Values
 
 NEW_US = 200_000
 """Maximum age of a sent measurement [µs]: the longest time that PX4's estimator waits for the next.
@@ -18,10 +16,10 @@ PX4 sends a measurement once."""
 LEAST_HEIGHT_M, GREATEST_HEIGHT_M, GREATEST_RAD_S = 0.08, 100.0, 8.0
 """Valid range of flow: defaults of SENS_FLOW_MINHGT, SENS_FLOW_MAXHGT and SENS_FLOW_MAXR."""
 
-POSE_FRAMES: dict[PoseFrame, int] = {"ned": 1, "frd": 2}
+POSE_FRAMES: dict[interfaces.PoseFrame, int] = {"ned": 1, "frd": 2}
 """VehicleOdometry.pose_frame."""
 
-VELOCITY_FRAMES: dict[VelocityFrame, int] = {"ned": 1, "frd": 2, "body": 3}
+VELOCITY_FRAMES: dict[interfaces.VelocityFrame, int] = {"ned": 1, "frd": 2, "body": 3}
 """VehicleOdometry.velocity_frame."""
 
 _CM, _CM2 = 1e2, 1e4
@@ -35,12 +33,12 @@ _TEMPERATURE, _NO_DISTANCE_US, _NO_DISTANCE_M = 0, 0, -1.0
 _NO_VECTOR = (math.nan, math.nan, math.nan)
 
 
-def distance_sensor(state: AutopilotState) -> Values | None:
+def distance_sensor(state: AutopilotState) -> sensor_table.Values | None:
     """Return the newest distance [cm]; None if outdated. PX4 does not send its quality."""
     newest = state.readings.get("distance")
     if newest is None or state.time_us - newest.time_us > NEW_US:
         return None
-    told: DistanceReading = newest.reading
+    told: interfaces.DistanceReading = newest.reading
     return (
         units.boot_ms(newest.time_us),
         _whole(told.least_m * _CM),
@@ -62,16 +60,16 @@ def _whole(value: float) -> int:
     return units.uint16(math.floor(value + 1e-9), unknown=0)
 
 
-def optical_flow_rad(state: AutopilotState) -> Values | None:
+def optical_flow_rad(state: AutopilotState) -> sensor_table.Values | None:
     """Return the newest flow and rotation [rad]; None if outdated."""
     newest = state.readings.get("flow")
     if newest is None or state.time_us - newest.time_us > NEW_US:
         return None
-    told: FlowReading = newest.reading
+    told: interfaces.FlowReading = newest.reading
     return (
         newest.time_us,
         _FIRST,
-        round(told.interval_s * US_PER_S),
+        round(told.interval_s * constants.US_PER_S),
         *told.flow.tolist(),
         *told.turned.tolist(),
         _TEMPERATURE,
@@ -81,13 +79,13 @@ def optical_flow_rad(state: AutopilotState) -> Values | None:
     )
 
 
-def _visual_odometry(state: AutopilotState) -> Values | None:
+def _visual_odometry(state: AutopilotState) -> sensor_table.Values | None:
     newest = state.readings.get("odometry")
     if newest is None:
         return None
     told = newest.reading
 
-    def numbers(values: Vector | None, count: int) -> list[float]:
+    def numbers(values: frames.Vector | None, count: int) -> list[float]:
         return [math.nan] * count if values is None else list(map(float, values))
 
     return (
@@ -106,7 +104,7 @@ def _visual_odometry(state: AutopilotState) -> Values | None:
     )
 
 
-def _distance(state: AutopilotState) -> Values | None:
+def _distance(state: AutopilotState) -> sensor_table.Values | None:
     newest = state.readings.get("distance")
     if newest is None:
         return None
@@ -126,7 +124,7 @@ def _distance(state: AutopilotState) -> Values | None:
     )
 
 
-def _optical_flow(state: AutopilotState) -> Values | None:
+def _optical_flow(state: AutopilotState) -> sensor_table.Values | None:
     newest = state.readings.get("flow")
     if newest is None:
         return None
@@ -137,7 +135,7 @@ def _optical_flow(state: AutopilotState) -> Values | None:
         *told.flow.tolist(),
         *told.turned.tolist(),
         math.nan,
-        round(told.interval_s * US_PER_S),
+        round(told.interval_s * constants.US_PER_S),
         told.quality,
         GREATEST_RAD_S,
         LEAST_HEIGHT_M,
@@ -147,11 +145,11 @@ def _optical_flow(state: AutopilotState) -> Values | None:
 
 _SIMULATED = "firmware_sim.addons.auxiliary_estimation.simulated_sensors"
 
-VISION = Sensor(
+VISION = sensor_table.Sensor(
     "odometry",
     f"{_SIMULATED}:PlantVision",
     topics={
-        "vehicle_visual_odometry": SensorTopic(
+        "vehicle_visual_odometry": sensor_table.SensorTopic(
             40,
             "uint64_t timestamp_sample; uint8_t pose_frame; float[3] position; float[4] q; "
             "uint8_t velocity_frame; "
@@ -163,12 +161,12 @@ VISION = Sensor(
     draws_always=True,
 )
 
-RANGEFINDER = Sensor(
+RANGEFINDER = sensor_table.Sensor(
     "distance",
     f"{_SIMULATED}:PlantRangefinder",
-    {"DISTANCE_SENSOR": SensorStream(distance_sensor)},
+    {"DISTANCE_SENSOR": sensor_table.SensorStream(distance_sensor)},
     {
-        "distance_sensor": SensorTopic(
+        "distance_sensor": sensor_table.SensorTopic(
             1000,
             "uint32_t device_id; float min_distance max_distance current_distance variance; "
             "int8_t signal_quality; uint8_t type; float h_fov v_fov; float[4] q; "
@@ -178,12 +176,12 @@ RANGEFINDER = Sensor(
     },
 )
 
-OPTICAL_FLOW = Sensor(
+OPTICAL_FLOW = sensor_table.Sensor(
     "flow",
     f"{_SIMULATED}:PlantOpticalFlow",
-    {"OPTICAL_FLOW_RAD": SensorStream(optical_flow_rad)},
+    {"OPTICAL_FLOW_RAD": sensor_table.SensorStream(optical_flow_rad)},
     {
-        "vehicle_optical_flow": SensorTopic(
+        "vehicle_optical_flow": sensor_table.SensorTopic(
             500,
             "uint64_t timestamp_sample; uint32_t device_id; float[2] pixel_flow; "
             "float[3] delta_angle; float distance_m; uint32_t integration_timespan_us; "

@@ -12,8 +12,7 @@ import math
 
 import numpy as np
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Vector, quat_from_euler
+from airl_mav.core import constants, frames
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.modes.interface import LandingTarget, ObstacleBins
@@ -95,7 +94,7 @@ def handle_vision_position(message: WireMessage, context: Context) -> bool:
         Odometry(
             _finite(message.x, message.y, message.z),
             None,
-            None if angles is None else quat_from_euler(*angles.tolist()),
+            None if angles is None else frames.quat_from_euler(*angles.tolist()),
             position_variance=variances[:3],
             orientation_variance=variances[3:],
             reset_counter=message.reset_counter,
@@ -111,18 +110,18 @@ def _see(odometry: Odometry, context: Context) -> bool:
     return True
 
 
-def _finite(x: float, y: float, z: float) -> Vector | None:
+def _finite(x: float, y: float, z: float) -> frames.Vector | None:
     vector = np.array([x, y, z])
     return vector if np.isfinite(vector).all() else None
 
 
 def _in_our_axes(
     frame: tuple[str, bool] | None,
-    vector: Vector | None,
+    vector: frames.Vector | None,
     covariance: tuple[float, ...],
     *,
     naive: bool,
-) -> tuple[Vector | None, Vector]:
+) -> tuple[frames.Vector | None, frames.Vector]:
     """Return a vector and variances (6,) in NED or FRD; None and NaN if unknown.
 
     `frame` is the name, and True if the axes must be converted; None = an unknown frame. A `naive`
@@ -140,23 +139,23 @@ def _in_our_axes(
     return None if vector is None else _ours(name, vector), variances
 
 
-def _ours(frame: str, vector: Vector) -> Vector:
+def _ours(frame: str, vector: frames.Vector) -> frames.Vector:
     """Return a vector in ENU as NED, or a vector in FLU as FRD."""
     a, b, up = vector.tolist()
     return np.array([b, a, -up]) if frame == "ned" else np.array([a, -b, -up])
 
 
-def _diagonal(triangle: tuple[float, ...]) -> Vector:
+def _diagonal(triangle: tuple[float, ...]) -> frames.Vector:
     """Return the diagonal (6,) of a covariance; NaN = unknown."""
     return np.array([triangle[i] for i in DIAGONAL])
 
 
-def _rotation(quaternion: Vector) -> Vector | None:
+def _rotation(quaternion: frames.Vector) -> frames.Vector | None:
     length = float(np.linalg.norm(quaternion))
     # The negated comparison also rejects NaN.
     if not abs(length - 1.0) <= _UNIT_TOLERANCE:
         return None
-    rotation: Vector = quaternion / length
+    rotation: frames.Vector = quaternion / length
     return rotation
 
 
@@ -197,7 +196,7 @@ def handle_optical_flow(message: WireMessage, context: Context) -> bool:
         "flow",
         FlowReading(
             np.array([message.integrated_x, message.integrated_y]),
-            message.integration_time_us / US_PER_S,
+            message.integration_time_us / constants.US_PER_S,
             message.quality,
             np.array(turned),
         ),

@@ -22,8 +22,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, OrbitStatus, Se
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes import interface
-from firmware_sim.autopilot.modes.automatic import Hold, landing_speed
+from firmware_sim.autopilot.modes import automatic, interface
 from firmware_sim.autopilot.modes.sticks import IDLE_THROTTLE, RELEASED, superexpo
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
@@ -170,7 +169,7 @@ class Follow(interface.FlightMode, modes=(Mode.FOLLOW,)):
 
     def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
-        self._waiting = Hold(context)
+        self._waiting = automatic.Hold(context)
         self._course = 0.0
         """Course of the target [rad]."""
         self._following = False
@@ -309,7 +308,7 @@ class PrecisionLand(interface.FlightMode, modes=(Mode.PRECISION_LAND,)):
         travel = self._context.travel
         if self._state in _DOWNWARDS:
             context = self._context
-            speed = landing_speed(context.value, context.height(state), context.ground_m)
+            speed = automatic.landing_speed(context.value, context.height(state), context.ground_m)
             return travel.fly(
                 state, time_us, PathSegment((north, east, math.nan), vertical_m_s=speed)
             )

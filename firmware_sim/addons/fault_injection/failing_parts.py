@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.noise import DepthNoise, noisy_frame
 from airl_mav.camera.render import Motion
-from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.core.frames import Vector, local_to_geodetic
+from airl_mav.core import constants, frames
 from airl_mav.faults import MOTORS, NOISE_SEED, SENSORS, Fault, gust_share
 from airl_mav.profiles.vehicle import Battery, SensorNoise, Sensors, VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
 from firmware_sim import interfaces
-from firmware_sim.engine.dynamics import Speeds
-from firmware_sim.engine.ticks import PA_PER_HPA
+from firmware_sim.engine import dynamics, ticks
 from firmware_sim.fault_timeline import Acting, FaultTimeline
 from firmware_sim.plant.camera import OnboardCamera
 from firmware_sim.plant.plant import Blowing, Plant
@@ -151,7 +149,7 @@ class Late:
     """Delay of samples. With `always`, the newest delivered sample is repeated in between."""
 
     def __init__(self, delay_s: float, *, always: bool) -> None:
-        self._delay_us = round(delay_s * US_PER_S)
+        self._delay_us = round(delay_s * constants.US_PER_S)
         self._always = always
         self._queue: deque[tuple[int, Any]] = deque()
         self._newest: Any = None
@@ -176,8 +174,8 @@ class Late:
 class Biased:
     """Error that is constant, or grows at a constant velocity."""
 
-    offset: Vector
-    velocity: Vector | None = None
+    offset: frames.Vector
+    velocity: frames.Vector | None = None
     since_us: int = 0
 
     def __call__(self, value: Any, time_us: int) -> Any:
@@ -186,14 +184,14 @@ class Biased:
             return None
         if self.velocity is None:
             return shifted(value, self.offset)
-        return shifted(value, self.velocity * ((time_us - self.since_us) / US_PER_S))
+        return shifted(value, self.velocity * ((time_us - self.since_us) / constants.US_PER_S))
 
 
 @dataclass
 class Noisy:
     """White noise in addition to the sensor's noise."""
 
-    sd: Vector
+    sd: frames.Vector
     rng: np.random.Generator
 
     def __call__(self, value: Any, time_us: int) -> Any:
@@ -212,10 +210,10 @@ class Noisy:
         return moved
 
 
-def shifted(value: Any, offset: Vector) -> Any:
+def shifted(value: Any, offset: frames.Vector) -> Any:
     """Return a measured value with an error: NED for a fix, the pose's frame for a pose."""
     if isinstance(value, interfaces.GpsFix):
-        return value._replace(position=local_to_geodetic(offset, value.position))
+        return value._replace(position=frames.local_to_geodetic(offset, value.position))
     if isinstance(value, interfaces.Odometry):
         return value if value.position is None else value._replace(position=value.position + offset)
     if isinstance(value, interfaces.DistanceReading):
@@ -239,10 +237,10 @@ def farther(reading: interfaces.DistanceReading, error_m: float) -> interfaces.D
     return reading._replace(distance_m=distance_m, quality=reading.quality if within else 0)
 
 
-def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
+def noise_sd(part: str, profile: Sensors, tick_s: float) -> frames.Vector:
     """Return the sd of a sensor's noise; for a fix or a pose, position (3) and velocity (3)."""
     # Profiles give noise per base tick; white noise of shorter ticks has a larger deviation.
-    white = math.sqrt(TICK_S / tick_s)
+    white = math.sqrt(constants.TICK_S / tick_s)
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
     vision = profile.vision
@@ -254,7 +252,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
         "gyro": [profile.imu.gyro_noise_rad_s * white] * 3,
         "mag": [profile.magnetometer.noise_gauss] * 3,
-        "baro": [profile.barometer.noise_pa / PA_PER_HPA],
+        "baro": [profile.barometer.noise_pa / ticks.PA_PER_HPA],
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
         "vision": [vision_sd[0]] * 3 + [vision_sd[1]] * 3,
         "rangefinder": [0.0 if ranges is None else ranges.noise_m],
@@ -298,14 +296,14 @@ def failed(
     return sample._replace(**changed)
 
 
-def gust_at(acting: Sequence[Acting], time_us: int) -> Vector:
+def gust_at(acting: Sequence[Acting], time_us: int) -> frames.Vector:
     """Return the wind (3,) NED [m/s] added by faults at a time [µs]."""
     total = np.zeros(3)
     for each in acting:
         share = 1.0
         if each.fault.kind == "gust":
             elapsed_us, whole_us = time_us - each.since_us, each.until_us - each.since_us
-            share = gust_share(elapsed_us / US_PER_S, whole_us / US_PER_S)
+            share = gust_share(elapsed_us / constants.US_PER_S, whole_us / constants.US_PER_S)
         total += share * np.array(each.fault.value)
     return total
 
@@ -315,11 +313,11 @@ class Gusts:
 
     def __init__(self, wind: Blowing) -> None:
         """Wrap the wind of the episode."""
-        self.more: Vector | None = None
+        self.more: frames.Vector | None = None
         """Additional wind (3,) NED [m/s] in the next tick; None = no additional wind."""
         self._wind = wind
 
-    def step(self) -> Vector:
+    def step(self) -> frames.Vector:
         """Advance one tick and return the wind (3,) NED [m/s]."""
         wind = self._wind.step()
         return wind if self.more is None else wind + self.more
@@ -355,7 +353,7 @@ class FailingParts:
         self._battery: list[Acting] = []
         self._left: dict[int, float] = {}
         self._slow: dict[int, float] = {}
-        self._turning: Speeds | None = None
+        self._turning: dynamics.Speeds | None = None
         """Latest effective motor commands; None = those of the flight controller."""
         self._gusts = Gusts(plant.wind)
         plant.wind = self._gusts
@@ -461,7 +459,7 @@ class FailingCamera:
             if kind == "off":
                 return
             if kind == "delay":
-                delay_us += round(each.fault.amount * US_PER_S)
+                delay_us += round(each.fault.amount * constants.US_PER_S)
             elif kind == "noise":
                 noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
                 # A separate stream per fault: a further fault must not change the noise of the

@@ -7,16 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, frames
 from firmware_sim import interfaces
-from firmware_sim.addons.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
-from firmware_sim.addons.flight_log.ulog_writer import UlogWriter, Values
+from firmware_sim.addons.flight_log import topics, ulog_writer
+from firmware_sim.autopilot import autopilot_state, parameter_store, snapshot
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import OperatorText, Setpoint, StateEstimate
-from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.snapshot import AutopilotState, setpoint_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
 
@@ -37,7 +33,7 @@ class FlownState:
     Status, home and parameters are not in the log: they are from the end of the ticks.
     """
 
-    def __init__(self, state: AutopilotState, tick: Any) -> None:
+    def __init__(self, state: snapshot.AutopilotState, tick: Any) -> None:
         """Combine the state after all ticks with one tick's log (`engine.record.FLOWN_TICK`)."""
         self._state, self._tick = state, tick
 
@@ -49,9 +45,9 @@ class FlownState:
         return int(self._tick["time_us"])
 
     @property
-    def estimate(self) -> StateEstimate:
-        row: Vector = self._tick["state"].copy()
-        return StateEstimate(
+    def estimate(self) -> autopilot_state.StateEstimate:
+        row: frames.Vector = self._tick["state"].copy()
+        return autopilot_state.StateEstimate(
             self.time_us,
             row[es.P : es.V],
             row[es.V : es.Q],
@@ -66,8 +62,8 @@ class FlownState:
         )
 
     @property
-    def setpoint(self) -> Setpoint:
-        return setpoint_of(self._tick, self._output(7, 10))
+    def setpoint(self) -> autopilot_state.Setpoint:
+        return snapshot.setpoint_of(self._tick, self._output(7, 10))
 
     attitude_setpoint = property(lambda self: self._output(0, 4))
     rate_setpoint = property(lambda self: self._output(4, 7))
@@ -80,12 +76,12 @@ class FlownState:
     motors = property(lambda self: tuple(self._tick["motors"].tolist()))
     battery = property(lambda self: interfaces.BatterySample(*self._tick["battery"].tolist()))
 
-    def _output(self, first: int, end: int) -> Vector:
-        values: Vector = self._tick["output"][first:end].copy()
+    def _output(self, first: int, end: int) -> frames.Vector:
+        values: frames.Vector = self._tick["output"][first:end].copy()
         return values
 
 
-GRID_US = 5 * TICK_US
+GRID_US = 5 * constants.TICK_US
 """Interval of checks for due topics [µs]; all topic intervals are multiples of it."""
 
 _PX4_RELEASE = 1 << 24 | 16 << 16 | 0 << 8 | 255
@@ -111,7 +107,7 @@ class UlogFlightLog:
     def __init__(
         self,
         path: Path,
-        parameters: Parameters,
+        parameters: parameter_store.Parameters,
         start_us: int,
         boot_unix_us: int,
         on_lost: Callable[[str], None] = lambda _: None,
@@ -124,8 +120,8 @@ class UlogFlightLog:
         self._boot_unix_us = boot_unix_us
         self.began_unix_us = boot_unix_us + start_us
         """Calendar time of the start of the log [µs since 1970]."""
-        self._due_us = [start_us] * len(TOPICS)
-        self._last: list[Values | None] = [None] * len(TOPICS)
+        self._due_us = [start_us] * len(topics.TOPICS)
+        self._last: list[ulog_writer.Values | None] = [None] * len(topics.TOPICS)
         self._truth: Any = None
         """True state after the newest tick (`engine.record.TRUE_TICK`)."""
         self._parameters = parameters
@@ -134,30 +130,30 @@ class UlogFlightLog:
         """All logs in the log's folder."""
         self.stop_listening: Callable[[], None] = lambda: None
         """Unsubscribe from parameter changes."""
-        self.writer = UlogWriter(
+        self.writer = ulog_writer.UlogWriter(
             path,
             start_us,
-            (SENSOR_COMBINED, *(logged.topic for logged in TOPICS)),
+            (topics.SENSOR_COMBINED, *(logged.topic for logged in topics.TOPICS)),
             (("sys_name", "airl-mav"), *DESCRIBED),
             self._known.items(),
             on_lost,
         )
 
-    def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
+    def after_ticks(self, flown: Record, truths: Record, state: snapshot.AutopilotState) -> None:
         """Log the due topics of n ticks, from their logs and the final autopilot state."""
         if self.writer.lost or self.writer.closed:
             return
         rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))
         for k, (time_us, gyro, accel) in enumerate(zip(*rows, strict=True)):
-            self.writer.sample(_SAMPLES, time_us, sensor_combined(gyro, accel))
+            self.writer.sample(_SAMPLES, time_us, topics.sensor_combined(gyro, accel))
             truth = truths[k - 1] if k else self._truth
             if time_us % GRID_US == 0 and truth is not None:
-                logged = cast(AutopilotState, FlownState(state, flown[k]))
-                moment = Moment(logged, truth_of(truth), self._boot_unix_us + time_us)
+                logged = cast(snapshot.AutopilotState, FlownState(state, flown[k]))
+                moment = topics.Moment(logged, truth_of(truth), self._boot_unix_us + time_us)
                 self._log(moment, time_us)
         self._truth = truths[-1].copy()
 
-    def text(self, message: OperatorText, time_us: int) -> None:
+    def text(self, message: autopilot_state.OperatorText, time_us: int) -> None:
         """Log an operator text."""
         if not self.writer.closed:
             self.writer.text(time_us, message.severity, message.text)
@@ -180,9 +176,9 @@ class UlogFlightLog:
         self.close()
         self.folder.close()
 
-    def _log(self, moment: Moment, now_us: int) -> None:
+    def _log(self, moment: topics.Moment, now_us: int) -> None:
         due_us, last = self._due_us, self._last
-        for i, logged in enumerate(TOPICS):
+        for i, logged in enumerate(topics.TOPICS):
             due = now_us >= due_us[i]
             if not due and not logged.on_change:
                 continue
@@ -194,7 +190,7 @@ class UlogFlightLog:
             self.writer.sample(1 + i, now_us, values)
 
 
-def _values(parameters: Parameters) -> Iterable[tuple[str, int | float]]:
+def _values(parameters: parameter_store.Parameters) -> Iterable[tuple[str, int | float]]:
     for index in range(len(parameters)):
         parameter = parameters.by_index(index)
         if parameter is not None:
@@ -222,7 +218,7 @@ class LogFolder(interfaces.LogStore):
         """Return the logs; the log currently written is last."""
         entries = [_entry(path) for path in self._completed()]
         if not self._current.writer.closed:
-            began_s = self._current.began_unix_us // US_PER_S
+            began_s = self._current.began_unix_us // constants.US_PER_S
             entries.append(interfaces.LogEntry(began_s, self._current.writer.size_bytes))
         return entries
 

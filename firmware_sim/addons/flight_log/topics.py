@@ -11,16 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
-from airl_mav.core.constants import TICK_US, US_PER_MS
-from airl_mav.core.frames import local_to_geodetic, quat_yaw
+from airl_mav.core import constants, frames
 from airl_mav.vehicle import atmosphere
-from firmware_sim import sensor_table
+from firmware_sim import interfaces, sensor_table
 from firmware_sim.addons.flight_log.ulog_writer import Topic, Values
-from firmware_sim.autopilot.autopilot_state import Arming, Landed
-from firmware_sim.autopilot.snapshot import AutopilotState
-from firmware_sim.interfaces import TrueState
+from firmware_sim.autopilot import autopilot_state, snapshot
 
-ON_CHANGE_US = 500 * US_PER_MS
+ON_CHANGE_US = 500 * constants.US_PER_MS
 """Maximum interval of topics that are logged on change [µs]."""
 
 DISARMED, ARMED = 1, 2
@@ -43,8 +40,8 @@ _UNKNOWN = math.nan
 class Moment(NamedTuple):
     """State of a vehicle and its simulator after a tick."""
 
-    state: AutopilotState
-    truth: TrueState
+    state: snapshot.AutopilotState
+    truth: interfaces.TrueState
     unix_us: int
     """Calendar time [µs since 1970]."""
 
@@ -82,7 +79,7 @@ _Values = TypeVar("_Values", bound=Callable[[Moment], "Values | None"])
 
 def _logged(name: str, interval_ms: int | None, fields: str) -> Callable[[_Values], _Values]:
     """Log a function's values as a topic; an interval of None = on change."""
-    interval_us = ON_CHANGE_US if interval_ms is None else interval_ms * US_PER_MS
+    interval_us = ON_CHANGE_US if interval_ms is None else interval_ms * constants.US_PER_MS
 
     def register(values: _Values) -> _Values:
         TOPICS.append(Logged(_topic(name, fields), interval_us, values, interval_ms is None))
@@ -94,7 +91,7 @@ def _logged(name: str, interval_ms: int | None, fields: str) -> Callable[[_Value
 def sensor_combined(gyro: Sequence[float], accel: Sequence[float]) -> Values:
     """Return a raw IMU sample: FRD [rad/s], [m/s²]."""
     offset_us, clipping = 0, (0, 0)
-    return (*gyro, TICK_US, offset_us, *accel, TICK_US, *clipping)
+    return (*gyro, constants.TICK_US, offset_us, *accel, constants.TICK_US, *clipping)
 
 
 @_logged("vehicle_angular_velocity", 20, "uint64_t timestamp_sample; float[3] xyz")
@@ -166,7 +163,7 @@ def local_position(moment: Moment) -> Values:
         *velocity,
         velocity[2],
         *estimate.acceleration.tolist(),
-        quat_yaw(estimate.quaternion),
+        frames.quat_yaw(estimate.quaternion),
         reference[2],
         math.hypot(*sigma[0:2]),
         sigma[2],
@@ -178,7 +175,7 @@ def local_position(moment: Moment) -> Values:
     )
 
 
-def _clearance(state: AutopilotState) -> Values:
+def _clearance(state: snapshot.AutopilotState) -> Values:
     """Return the distance to the ground [m], variance [m²], validity, resets and sensor."""
     ground = state.clearance
     if ground is None:
@@ -202,7 +199,7 @@ def true_local_position(moment: Moment) -> Values:
     """Return the true position [m] and velocity [m/s], NED."""
     truth = moment.truth
     velocity = truth.velocity.tolist()
-    heading = quat_yaw(truth.quaternion)
+    heading = frames.quat_yaw(truth.quaternion)
     return truth.time_us, *truth.position.tolist(), *velocity, velocity[2], heading, *(True,) * 4
 
 
@@ -226,7 +223,7 @@ def local_position_setpoint(moment: Moment) -> Values:
 def motors(moment: Moment) -> Values:
     """Return the motor commands 0..1; NaN while disarmed."""
     state = moment.state
-    armed = state.status.arming is Arming.ARMED
+    armed = state.status.arming is autopilot_state.Arming.ARMED
     motors = state.motors if armed else (math.nan,) * 4
     return state.time_us, *motors, *_UNUSED_MOTORS, 0
 
@@ -272,7 +269,7 @@ def _of_sensor(name: str, logged: sensor_table.SensorTopic) -> Logged:
     def values(moment: Moment) -> Values | None:
         return logged.values(moment.state)
 
-    return Logged(_topic(name, logged.fields), logged.interval_ms * US_PER_MS, values)
+    return Logged(_topic(name, logged.fields), logged.interval_ms * constants.US_PER_MS, values)
 
 
 TOPICS += [_of_sensor(*each) for s in sensor_table.sensors().values() for each in s.topics.items()]
@@ -290,7 +287,7 @@ def global_position(moment: Moment) -> Values | None:
     estimate, origin = state.estimate, state.origin
     if origin is None or not estimate.healthy:
         return None
-    latitude, longitude, altitude = local_to_geodetic(estimate.position, origin)
+    latitude, longitude, altitude = frames.local_to_geodetic(estimate.position, origin)
     sigma = estimate.sigma.tolist()
     accuracy = math.hypot(*sigma[0:2]), sigma[2]
     return estimate.time_us, latitude, longitude, altitude, altitude, *accuracy, True, True
@@ -359,12 +356,12 @@ def status(moment: Moment) -> Values:
     """Return the arming state and the flight mode."""
     status = moment.state.status
     return (
-        ARMED if status.arming is Arming.ARMED else DISARMED,
+        ARMED if status.arming is autopilot_state.Arming.ARMED else DISARMED,
         status.intended_mode.spec.state,
         status.mode.spec.state,
         ROTARY_WING,
         status.failsafe,
-        status.arming is not Arming.BOOT,
+        status.arming is not autopilot_state.Arming.BOOT,
     )
 
 
@@ -372,13 +369,13 @@ def status(moment: Moment) -> Values:
 def armed(moment: Moment) -> Values:
     """Return the armed flag and the ready-to-arm flag."""
     arming = moment.state.status.arming
-    return arming is Arming.ARMED, arming is not Arming.BOOT
+    return arming is autopilot_state.Arming.ARMED, arming is not autopilot_state.Arming.BOOT
 
 
 @_logged("vehicle_land_detected", None, "bool ground_contact maybe_landed landed")
 def land_detected(moment: Moment) -> Values:
     """Return the landed flags."""
-    landed = moment.state.status.landed is Landed.ON_GROUND
+    landed = moment.state.status.landed is autopilot_state.Landed.ON_GROUND
     return landed, landed, landed
 
 

@@ -20,7 +20,7 @@ from typing import Any
 from airl_mav.core.addons import entries, load
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.addons.ground_station_services.files import Storage
-from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot import autopilot_state, flight_modes, prearm
 from firmware_sim.autopilot.events import flight_events, health_report
 from firmware_sim.autopilot.events.definition import (
     ENUMERATIONS,
@@ -30,8 +30,6 @@ from firmware_sim.autopilot.events.definition import (
     sub_id,
     words,
 )
-from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.prearm import CHECKS
 from firmware_sim.mavlink.codec import crc32part, dialect
 from firmware_sim.mavlink.services import Action, Context, VehicleCommand
 from firmware_sim.mavlink.streams.units import boot_ms
@@ -69,17 +67,17 @@ def provide(storage: Storage) -> None:
         (folder / name).write_bytes(data)
 
 
-def request_metadata(_command: VehicleCommand, context: Context) -> Result:
+def request_metadata(_command: VehicleCommand, context: Context) -> autopilot_state.Result:
     """Send COMPONENT_METADATA."""
     context.link.send(
         dialect.MAVLink_component_metadata_message(
             boot_ms(context.now_us), crc32part(files()[_GENERAL]), _uri()
         )
     )
-    return Result.ACCEPTED
+    return autopilot_state.Result.ACCEPTED
 
 
-def request_information(_command: VehicleCommand, context: Context) -> Result:
+def request_information(_command: VehicleCommand, context: Context) -> autopilot_state.Result:
     """Send COMPONENT_INFORMATION, the predecessor of COMPONENT_METADATA."""
     no_crc, no_uri = 0, b""
     context.link.send(
@@ -87,14 +85,14 @@ def request_information(_command: VehicleCommand, context: Context) -> Result:
             boot_ms(context.now_us), crc32part(files()[_GENERAL]), _uri(), no_crc, no_uri
         )
     )
-    return Result.ACCEPTED
+    return autopilot_state.Result.ACCEPTED
 
 
-def _request_storage(command: VehicleCommand, context: Context) -> Result:
+def _request_storage(command: VehicleCommand, context: Context) -> autopilot_state.Result:
     """Handle parameter 2: storage number; 0 = all. The only storage has number 1."""
     number, count, empty = 1, 1, b""
     if command.integer(2) not in (None, 0, number):
-        return Result.DENIED
+        return autopilot_state.Result.DENIED
     disk = shutil.disk_usage(context.vehicle_state(Storage).folder)
     # STORAGE_INFORMATION has mebibytes.
     sizes = (size / _MIB for size in (disk.total, disk.used, disk.free))
@@ -105,7 +103,7 @@ def _request_storage(command: VehicleCommand, context: Context) -> Result:
             *(*sizes, no_speed, no_speed, dialect.STORAGE_TYPE_UNKNOWN, empty),
         )
     )
-    return Result.ACCEPTED
+    return autopilot_state.Result.ACCEPTED
 
 
 def _uri() -> bytes:
@@ -150,7 +148,7 @@ def definitions() -> Iterator[Definition]:
         for value in vars(module).values():
             if isinstance(value, Definition):
                 yield value
-    for check in CHECKS:
+    for check in prearm.CHECKS:
         yield check.event
 
 
@@ -199,7 +197,7 @@ def _modes_of_groups() -> dict[str, list[int]]:
     """Return the custom modes by bit number of the mode groups in checks."""
     groups = {group.value for group in ModeGroup}
     # A mode can have several bits in the checks; its lowest bit names the group.
-    lowest = {mode: mode.spec.state_bits & -mode.spec.state_bits for mode in Mode}
+    lowest = {mode: mode.spec.state_bits & -mode.spec.state_bits for mode in flight_modes.Mode}
     return {
         str(bit.bit_length() - 1): [mode.spec.custom_mode]
         for mode, bit in lowest.items()

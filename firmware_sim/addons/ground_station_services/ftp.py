@@ -12,8 +12,7 @@ from pathlib import Path
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.addons.ground_station_services import component_metadata, files
-from firmware_sim.mavlink import services
-from firmware_sim.mavlink.codec import WireMessage, crc32part
+from firmware_sim.mavlink import codec, services
 
 _HEADER = struct.Struct("<HBBBBBxI")
 """Header: sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
@@ -55,7 +54,7 @@ class Checksum:
     def next_part(self) -> bytes | None:
         """Read the next part; return the reply's data after the last. Raises OSError."""
         chunk = self._file.read(files.CHUNK_BYTES)
-        self._crc = crc32part(chunk, self._crc)
+        self._crc = codec.crc32part(chunk, self._crc)
         # A full chunk means that more data may follow, possibly empty.
         return None if len(chunk) == files.CHUNK_BYTES else self._crc.to_bytes(4, "little")
 
@@ -92,7 +91,7 @@ class FtpClient(services.ServiceState):
             self.checksum = None
 
 
-def handle_request(message: WireMessage, context: services.Context) -> bool:
+def handle_request(message: codec.WireMessage, context: services.Context) -> bool:
     """Execute a request and reply."""
     payload = bytes(message.payload)
     sequence, session, opcode, size, _, _, offset = _HEADER.unpack_from(payload)

@@ -19,8 +19,7 @@ from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.message_rates import OFF
-from firmware_sim.mavlink.streams import Builder, no_content, units
-from firmware_sim.mavlink.streams.sensors import scaled_pressure
+from firmware_sim.mavlink.streams import Builder, no_content, sensors, units
 from firmware_sim.mavlink.streams.status import NO_MISSION, base_mode
 from firmware_sim.mavlink.streams.units import boot_ms, percent
 
@@ -297,7 +296,7 @@ BUILDERS: dict[str, Builder] = {
     "HIL_ACTUATOR_CONTROLS": hil_actuator_controls,
     "SCALED_IMU": scaled_imu,
     # PX4's simulator sends one measurement to two barometers.
-    "SCALED_PRESSURE2": scaled_pressure,
+    "SCALED_PRESSURE2": sensors.scaled_pressure,
     "FLIGHT_INFORMATION": flight_information,
     "PROTOCOL_VERSION": protocol_version,
     "HIGH_LATENCY2": high_latency2,

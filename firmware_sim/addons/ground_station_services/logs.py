@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
-from firmware_sim.mavlink import services
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink import codec, services
 
 PACKETS_PER_TICK = 8
 """LOG_DATA messages per client and tick: 180 kB per second."""
@@ -125,7 +124,7 @@ class LogStream:
 class LogTransfers(services.ServiceState):
     """Log transfers of one client."""
 
-    listing: deque[WireMessage] = field(default_factory=deque)
+    listing: deque[codec.WireMessage] = field(default_factory=deque)
     """LOG_ENTRY messages that remain to be sent, one per tick."""
     download: LogDownload | None = None
     stream: LogStream | None = None
@@ -152,31 +151,31 @@ def send_pending(context: services.Context) -> None:
 # --- list and download
 
 
-def handle_list(message: WireMessage, context: services.Context) -> bool:
+def handle_list(message: codec.WireMessage, context: services.Context) -> bool:
     """Start sending the entries from `start` to `end`."""
     entries = context.port.logs.entries()
     total = len(entries)
     # An empty list is one entry with count 0.
     if total == 0:
-        context.link.send(dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
+        context.link.send(codec.dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0))
         return True
     # Clients request up to 65535: the range ends at the last log.
     first, last = (min(number, total - 1) for number in (message.start, message.end))
     context.state(LogTransfers).listing = deque(
-        dialect.MAVLink_log_entry_message(number, total, total - 1, *entries[number])
+        codec.dialect.MAVLink_log_entry_message(number, total, total - 1, *entries[number])
         for number in range(first, last + 1)
     )
     return True
 
 
-def handle_data(message: WireMessage, context: services.Context) -> bool:
+def handle_data(message: codec.WireMessage, context: services.Context) -> bool:
     """Start sending a part of a log."""
     end = message.ofs + message.count
     context.state(LogTransfers).download = LogDownload(message.id, message.ofs, end)
     return True
 
 
-def handle_end(_message: WireMessage, context: services.Context) -> bool:
+def handle_end(_message: codec.WireMessage, context: services.Context) -> bool:
     """Stop sending."""
     logs = context.state(LogTransfers)
     logs.listing.clear()
@@ -184,7 +183,7 @@ def handle_end(_message: WireMessage, context: services.Context) -> bool:
     return True
 
 
-def handle_erase(_message: WireMessage, context: services.Context) -> bool:
+def handle_erase(_message: codec.WireMessage, context: services.Context) -> bool:
     """Reject the request: a flight's log is its record, and clients may not delete it."""
     context.announce(OperatorText(Severity.WARNING, "Logs are not erased: they belong to the run"))
     return True
@@ -221,7 +220,7 @@ def _stop(_command: services.VehicleCommand, context: services.Context) -> None:
     context.state(LogTransfers).stream = None
 
 
-def handle_ack(message: WireMessage, context: services.Context) -> bool:
+def handle_ack(message: codec.WireMessage, context: services.Context) -> bool:
     """Continue after an acknowledged piece of the log header."""
     stream = context.state(LogTransfers).stream
     if stream is None or stream.waiting is None or stream.waiting.sequence != message.sequence:
@@ -256,17 +255,17 @@ def _stream(context: services.Context, stream: LogStream) -> None:
                 stream.skip_to(log.size_bytes)
         if in_head or piece is None:
             return
-        context.link.send(dialect.MAVLink_logging_data_message(*stream.target, *piece))
+        context.link.send(codec.dialect.MAVLink_logging_data_message(*stream.target, *piece))
 
 
 def _send_acked(context: services.Context, stream: LogStream, piece: Piece) -> None:
     stream.sent_us, stream.tries = context.now_us, stream.tries + 1
-    context.link.send(dialect.MAVLink_logging_data_acked_message(*stream.target, *piece))
+    context.link.send(codec.dialect.MAVLink_logging_data_acked_message(*stream.target, *piece))
 
 
 ACTIONS: dict[int, services.Action] = {
-    dialect.MAV_CMD_LOGGING_START: _start,
-    dialect.MAV_CMD_LOGGING_STOP: _stop,
+    codec.dialect.MAV_CMD_LOGGING_START: _start,
+    codec.dialect.MAV_CMD_LOGGING_STOP: _stop,
 }
 
 HANDLERS: services.Handlers = {

@@ -11,10 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Arming
-from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.snapshot import AutopilotState
+from firmware_sim.autopilot import autopilot, autopilot_state, flight_modes, snapshot
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import Context, Handlers, ServiceState, for_anyone
 
@@ -91,11 +88,11 @@ def send_pending(context: Context) -> None:
 
 # --- commands: each prints PX4's output, as far as available here
 
-Shown = Callable[[Sequence[str], BuiltinAutopilot, int], str]
+Shown = Callable[[Sequence[str], autopilot.BuiltinAutopilot, int], str]
 """Returns the output of a command, given its arguments, the autopilot, and the time [µs]."""
 
 
-def run(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
+def run(words: Sequence[str], port: autopilot.BuiltinAutopilot, now_us: int) -> str:
     """Return the output of a command line, in whole lines."""
     if not words:
         return ""
@@ -108,7 +105,7 @@ def run(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
 _VERSION = "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
 
 
-def _parameters(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
+def _parameters(words: Sequence[str], port: autopilot.BuiltinAutopilot, _now_us: int) -> str:
     """Run param show [NAME, with * and ?]."""
     # Only `show` is supported: the shell is read-only.
     if not words or words[0] != "show" or len(words) > 2:
@@ -126,11 +123,11 @@ def _parameters(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> s
     return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])
 
 
-def _commander(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> str:
+def _commander(words: Sequence[str], port: autopilot.BuiltinAutopilot, _now_us: int) -> str:
     if list(words) != ["status"]:
         return "usage: commander status\n"
     status = port.state().status
-    armed = "Armed" if status.arming is Arming.ARMED else "Disarmed"
+    armed = "Armed" if status.arming is autopilot_state.Arming.ARMED else "Disarmed"
     lines = (
         armed,
         f"navigation mode: {_title(status.mode)}",
@@ -140,21 +137,21 @@ def _commander(words: Sequence[str], port: BuiltinAutopilot, _now_us: int) -> st
     return "".join(f"INFO  [commander] {line}\n" for line in lines)
 
 
-def _title(mode: Mode) -> str:
+def _title(mode: flight_modes.Mode) -> str:
     return mode.name.replace("_", " ").title()
 
 
-def _local_position(state: AutopilotState) -> dict[str, float]:
+def _local_position(state: snapshot.AutopilotState) -> dict[str, float]:
     estimate = state.estimate
     names = ("x", "y", "z", "vx", "vy", "vz")
     return dict(zip(names, (*estimate.position.tolist(), *estimate.velocity.tolist()), strict=True))
 
 
-def _attitude(state: AutopilotState) -> dict[str, float]:
+def _attitude(state: snapshot.AutopilotState) -> dict[str, float]:
     return {f"q[{i}]": q for i, q in enumerate(state.estimate.quaternion.tolist())}
 
 
-def _battery(state: AutopilotState) -> dict[str, float]:
+def _battery(state: snapshot.AutopilotState) -> dict[str, float]:
     battery = state.battery
     return {
         "voltage_v": battery.voltage_v,
@@ -164,18 +161,18 @@ def _battery(state: AutopilotState) -> dict[str, float]:
     }
 
 
-def _vehicle_status(state: AutopilotState) -> dict[str, float]:
+def _vehicle_status(state: snapshot.AutopilotState) -> dict[str, float]:
     status = state.status
     return {
         "armed_time": state.armed_us,
         "takeoff_time": state.takeoff_us,
-        "arming_state": 2 if status.arming is Arming.ARMED else 1,
+        "arming_state": 2 if status.arming is autopilot_state.Arming.ARMED else 1,
         "failsafe": status.failsafe,
-        "pre_flight_checks_pass": status.arming is not Arming.BOOT,
+        "pre_flight_checks_pass": status.arming is not autopilot_state.Arming.BOOT,
     }
 
 
-_TOPICS: Mapping[str, Callable[[AutopilotState], Mapping[str, float]]] = {
+_TOPICS: Mapping[str, Callable[[snapshot.AutopilotState], Mapping[str, float]]] = {
     "battery_status": _battery,
     "vehicle_attitude": _attitude,
     "vehicle_local_position": _local_position,
@@ -183,7 +180,7 @@ _TOPICS: Mapping[str, Callable[[AutopilotState], Mapping[str, float]]] = {
 }
 
 
-def _listener(words: Sequence[str], port: BuiltinAutopilot, now_us: int) -> str:
+def _listener(words: Sequence[str], port: autopilot.BuiltinAutopilot, now_us: int) -> str:
     """Run listener TOPIC: print its newest message once."""
     topic = words[0] if words else ""
     fields = _TOPICS.get(topic)

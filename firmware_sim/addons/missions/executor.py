@@ -13,8 +13,7 @@ from enum import Enum, auto
 
 from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.addons.missions import items
-from firmware_sim.addons.missions.feasibility import FeasibilityResult
+from firmware_sim.addons.missions import feasibility, items
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events.definition import Level, MavlinkEvent, define
 from firmware_sim.autopilot.navigation import plan
@@ -112,7 +111,7 @@ class MissionExecutor:
         plans: plan.Plans,
         value: Callable[[str], float],
         crew: plan.Crew,
-        check: Callable[[plan.NavigationState], FeasibilityResult],
+        check: Callable[[plan.NavigationState], feasibility.FeasibilityResult],
         *,
         climbs_first: bool = True,
     ) -> None:

@@ -18,8 +18,7 @@ import numpy as np
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.addons.missions.executor import MissionExecutor
-from firmware_sim.addons.missions.feasibility import FeasibilityResult, check
+from firmware_sim.addons.missions import executor, feasibility
 from firmware_sim.addons.missions.items import (
     STANDING,
     NavCommand,
@@ -225,11 +224,11 @@ class MissionManager(plan.Missions):
     ) -> None:
         """Store the plans, the look-up for PX4 parameters, the callbacks and the geofence."""
         self._plans, self._value, self._crew, self._fence = plans, value, crew, fence
-        self.executor = MissionExecutor(plans, value, crew, self._check)
+        self.executor = executor.MissionExecutor(plans, value, crew, self._check)
         """Mission executor, which also holds region of interest and speed."""
         self._way_home = plan.Plans()
         """Mission items flown by Return."""
-        self._returning = MissionExecutor(
+        self._returning = executor.MissionExecutor(
             self._way_home, value, crew, self._check_way_home, climbs_first=False
         )
         self._home_by_mission = False
@@ -344,11 +343,11 @@ class MissionManager(plan.Missions):
         self._crew.say(OperatorText(Severity.INFO, text, event))
         return (at(_N.WAYPOINT, here, altitude), *landing)
 
-    def _check_way_home(self, _now: plan.NavigationState) -> FeasibilityResult:
-        return FeasibilityResult(bool(self._way_home.mission), ())
+    def _check_way_home(self, _now: plan.NavigationState) -> feasibility.FeasibilityResult:
+        return feasibility.FeasibilityResult(bool(self._way_home.mission), ())
 
-    def _check(self, now: plan.NavigationState) -> FeasibilityResult:
-        return check(
+    def _check(self, now: plan.NavigationState) -> feasibility.FeasibilityResult:
+        return feasibility.check(
             self._plans.mission,
             now.home,
             self._value,

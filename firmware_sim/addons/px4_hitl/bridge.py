@@ -25,12 +25,8 @@ from firmware_sim.addons.px4_hitl.line import (
     carries_bytes_s,
     check_baud,
 )
+from firmware_sim.external import flight_stack, launcher, observer, parameters, programs
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.external import parameters
-from firmware_sim.external.flight_stack import FirmwareRequest
-from firmware_sim.external.launcher import Launcher, no_process
-from firmware_sim.external.observer import FORCE, SYSTEM_ID
-from firmware_sim.external.programs import FirmwareKind
 from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Encoder, Values, WireLayout, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import Endpoint
@@ -194,7 +190,7 @@ class BoardLink:
         self._router = router
         self._baud = baud
         self._budget_bytes_s = check_line(device, baud)
-        self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_USER1)
+        self._encoder = Encoder(observer.SYSTEM_ID, dialect.MAV_COMP_ID_USER1)
         self._line: SerialPort | None = None
         self._beat_due_us = 0
 
@@ -308,7 +304,7 @@ class BoardLink:
     def disarm(self) -> None:
         """Disarm a board in HIL mode, in any state."""
         if self.board.ready:
-            self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, FORCE)
+            self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, observer.FORCE)
 
     def _command(self, number: int, first: float, second: float = 0.0) -> None:
         target = self.board.system, dialect.MAV_COMP_ID_AUTOPILOT1
@@ -464,7 +460,7 @@ class HitlBridge:
         if link.board.rebooting:
             # The next connection must not mistake this board for a rebooted board.
             with suppress(interfaces.FirmwareLostError):
-                link.go_down(no_process)
+                link.go_down(launcher.no_process)
                 link.went_down = True
         elif self.armed or link.board.armed:
             link.disarm()
@@ -512,7 +508,7 @@ class HitlBridge:
             self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
 
 
-def px4_hitl_parts(request: FirmwareRequest) -> tuple[Launcher, Endpoint]:
+def px4_hitl_parts(request: flight_stack.FirmwareRequest) -> tuple[launcher.Launcher, Endpoint]:
     """Bind the clients' ports. Return the launcher for the board, and the observer's endpoint."""
     options = request.aircraft.real
     airframe = parameters.px4_airframe(request.vehicle, parameters.HITL_OUTPUT)
@@ -523,10 +519,10 @@ def px4_hitl_parts(request: FirmwareRequest) -> tuple[Launcher, Endpoint]:
     except UsageError:
         router.close()
         raise
-    return Launcher(airframe, partial(HitlBridge, link), options.firmware_timeout), router
+    return launcher.Launcher(airframe, partial(HitlBridge, link), options.firmware_timeout), router
 
 
-PX4_HITL = FirmwareKind(
+PX4_HITL = programs.FirmwareKind(
     airframe=partial(parameters.px4_airframe, output=parameters.HITL_OUTPUT),
     parameter_file=parameters.qgroundcontrol_file,
     parts=f"{__name__}:px4_hitl_parts",

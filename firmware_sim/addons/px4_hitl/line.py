@@ -18,15 +18,13 @@ from typing import NamedTuple
 import serial
 from serial.tools import list_ports
 
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from firmware_sim.mavlink.codec import Decoder, WireMessage, dialect, message_id
+from firmware_sim.mavlink import codec, link
 from firmware_sim.mavlink.endpoint import Endpoint
-from firmware_sim.mavlink.link import LinkCounters
 
 SIMULATOR_IDS = frozenset(
-    message_id(name)
+    codec.message_id(name)
     for name in (
         "HIL_ACTUATOR_CONTROLS",
         "HIL_CONTROLS",
@@ -51,15 +49,15 @@ class RoutedFrame(NamedTuple):
 
     raw: bytes
     number: int
-    message: WireMessage
+    message: codec.WireMessage
 
     @property
     def known(self) -> bool:
         """True if the dialect has the message, so that its checksum was checked."""
-        return self.number in dialect.mavlink_map
+        return self.number in codec.dialect.mavlink_map
 
 
-class FrameDecoder(Decoder):
+class FrameDecoder(codec.Decoder):
     """Decoder that keeps the bytes of each frame, also of messages unknown to the dialect."""
 
     def __init__(self, *, datagrams: bool) -> None:
@@ -72,7 +70,7 @@ class FrameDecoder(Decoder):
         found, self._frames = self._frames, []
         return found
 
-    def _decode(self, buffer: bytes, start: int, end: int) -> WireMessage | None:
+    def _decode(self, buffer: bytes, start: int, end: int) -> codec.WireMessage | None:
         message = super()._decode(buffer, start, end)
         if message is not None:
             self._frames.append(RoutedFrame(buffer[start:end], int(message.get_msgId()), message))
@@ -92,7 +90,7 @@ class TokenBucket:
     def take(self, count: int) -> bool:
         """Return True and spend `count` bytes if they may be sent now."""
         now_us = self._clock.time_us()
-        self._left += self._bytes_s * (now_us - self._then_us) / US_PER_S
+        self._left += self._bytes_s * (now_us - self._then_us) / constants.US_PER_S
         self._left, self._then_us = min(self._left, BURST_BYTES), now_us
         if count > self._left:
             return False
@@ -122,7 +120,7 @@ class Router:
         """Set the clients' endpoints by link name. The router closes them."""
         self.lost: str | None = None
         """Reason for the loss of the line; None = line present, or never attached."""
-        self.on_message: Callable[[WireMessage], None] | None = None
+        self.on_message: Callable[[codec.WireMessage], None] | None = None
         """Callback for every message of the board known to the dialect; None = no callback."""
         self.send_errors = 0
         self.received_bytes = 0
@@ -247,10 +245,10 @@ class Router:
         # the descriptor of epoll or kqueue
         return None if self._closed else self._selector.fileno()
 
-    def counters(self) -> dict[str, LinkCounters]:
+    def counters(self) -> dict[str, link.LinkCounters]:
         """Return the traffic counters of each client."""
         return {
-            name: LinkCounters(
+            name: link.LinkCounters(
                 client.rx,
                 client.tx,
                 client.decoder.malformed,
@@ -314,7 +312,7 @@ class SerialPort:
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:
-            raise UsageError(_open_problem(device, baud, error)) from error
+            raise errors.UsageError(_open_problem(device, baud, error)) from error
         self._waiting = bytearray()
         self._fd: int = self._port.fileno()
         self._poll = select.poll()
@@ -395,7 +393,7 @@ class SerialPort:
 def check_baud(baud: int) -> None:
     """Raise UsageError if the baud rate is out of range."""
     if baud not in BAUDS:
-        raise UsageError(f"--baud {baud}: must be in {BAUDS[0]}..{BAUDS[-1]}")
+        raise errors.UsageError(f"--baud {baud}: must be in {BAUDS[0]}..{BAUDS[-1]}")
 
 
 def carries_bytes_s(device: str, baud: int) -> int | None:

@@ -22,7 +22,7 @@ from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause, MavlinkEvent
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
-from firmware_sim.autopilot.failsafes import failsafe_conditions, failsafe_table
+from firmware_sim.autopilot.failsafes import failsafe_conditions, failsafe_table, watch
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
     Clear,
@@ -33,7 +33,6 @@ from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     can_run,
 )
 from firmware_sim.autopilot.failsafes.failsafe_table import Situation
-from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.prearm import ArmingSettings, PrearmCheck, Readiness
 from firmware_sim.autopilot.sensor_monitor import NO_DATA_US
@@ -390,7 +389,7 @@ class Supervisor:
         """Store the look-up for PX4 parameters, the estimator and the event callback."""
         self._value = value
         self._estimator = estimator
-        self.watch = Watch(value, estimator)
+        self.watch = watch.Watch(value, estimator)
         """Monitors for signals and measurements."""
         self.sensors = self.watch.sensors
         """Sensor validity."""

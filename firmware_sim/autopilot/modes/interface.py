@@ -12,8 +12,7 @@ from enum import Enum, auto
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Vector, quat_yaw
+from airl_mav.core import constants, frames
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Clearance, OperatorText, OrbitStatus, Setpoint
 from firmware_sim.autopilot.climb import Climb
@@ -179,7 +178,7 @@ class ManualControl:
         # After a loss, the first sticks are the rest position.
         if not fresh:
             self._rest = sticks
-        elapsed_s = (time_us - self._time_us) / US_PER_S
+        elapsed_s = (time_us - self._time_us) / constants.US_PER_S
         # Low-pass with the real time between messages.
         weight = min(1.0, elapsed_s / (elapsed_s + FOLLOWED_S)) if elapsed_s > 0.0 else 0.0
         self._rest = Sticks(
@@ -192,7 +191,7 @@ class ManualControl:
 
     def sticks(self, time_us: int) -> Sticks | None:
         """Return the sticks; None before the first and after COM_RC_LOSS_T without input."""
-        limit_us = self._value("COM_RC_LOSS_T") * US_PER_S
+        limit_us = self._value("COM_RC_LOSS_T") * constants.US_PER_S
         if self._sticks is None or time_us - self._time_us > limit_us:
             return None
         return self._sticks
@@ -259,7 +258,7 @@ class FlightContext:
         """Store an offboard setpoint."""
         self.setpoint = self.setpoints[type(setpoint)] = setpoint
 
-    def height(self, state: Vector) -> float:
+    def height(self, state: frames.Vector) -> float:
         """Return the height above home [m]."""
         return self.home[2] - state.item(P + 2)
 
@@ -269,7 +268,7 @@ class FlightContext:
         ground = self.ground
         return NAN if ground is None or not ground.valid else ground.dist_bottom_m
 
-    def over_ground(self, state: Vector) -> float:
+    def over_ground(self, state: frames.Vector) -> float:
         """Return the height above ground [m], or above home if the ground is unknown."""
         ground_m = self.ground_m
         return self.height(state) if math.isnan(ground_m) else ground_m
@@ -308,7 +307,7 @@ class FlightMode(Protocol):
         """Destination of an automatic mode, local NED [m]; None in all other modes."""
         return None
 
-    def enter(self, _state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, _state: frames.Vector, _request: ModeRequest | None, /) -> None:
         """Start at the current state.
 
         The request comes from the user, or from the previous mode (its `remainder`). Modes ignore
@@ -316,15 +315,15 @@ class FlightMode(Protocol):
         """
         return
 
-    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+    def demand(self, state: frames.Vector, time_us: int, /) -> AnyDemand:
         """Return the demand at a time [µs], which increases from call to call."""
         ...
 
-    def remainder(self, _state: Vector, /) -> ModeRequest | None:
+    def remainder(self, _state: frames.Vector, /) -> ModeRequest | None:
         """Return a request for the next mode; None = the next mode starts without."""
         return None
 
-    def is_done(self, _state: Vector, /) -> bool:
+    def is_done(self, _state: frames.Vector, /) -> bool:
         """Return whether the mode has reached its goal, so that another one should follow."""
         return False
 
@@ -347,12 +346,12 @@ def descend(yaw: float) -> Demand:
 
 def since(before_us: int | None, now_us: int) -> float:
     """Return the time since the last tick [s]; 0 at the first."""
-    return 0.0 if before_us is None else (now_us - before_us) / US_PER_S
+    return 0.0 if before_us is None else (now_us - before_us) / constants.US_PER_S
 
 
-def here(state: Vector) -> PositionYaw:
+def here(state: frames.Vector) -> PositionYaw:
     """Return the current position and heading."""
-    return PositionYaw(triple(state, P), quat_yaw(state[Q:RATES]))
+    return PositionYaw(triple(state, P), frames.quat_yaw(state[Q:RATES]))
 
 
 def over(place: PositionYaw, down_m_s: float) -> Demand:

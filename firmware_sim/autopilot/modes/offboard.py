@@ -17,8 +17,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.error_state import RATES
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes import interface
-from firmware_sim.autopilot.modes.automatic import ABOVE_HOME_M, Hold
+from firmware_sim.autopilot.modes import automatic, interface
 from firmware_sim.autopilot.modes.interface import ModeRequest
 
 CLIMBS_M_S = 0.1
@@ -33,7 +32,7 @@ class Offboard(interface.FlightMode, modes=(Mode.OFFBOARD,)):
 
     def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
-        self._waiting = Hold(context)
+        self._waiting = automatic.Hold(context)
         self._setpoint: interface.OffboardSetpoint | None = None
         self._flown: AnyDemand | None = None
         self._kind: type = Setpoint
@@ -49,7 +48,7 @@ class Offboard(interface.FlightMode, modes=(Mode.OFFBOARD,)):
             return False
         if isinstance(demand, AttitudeDemand | RateDemand):
             return True
-        above = self._context.home[2] - ABOVE_HOME_M
+        above = self._context.home[2] - automatic.ABOVE_HOME_M
         if isinstance(demand, TrajectoryDemand) and demand.acceleration[2] < -CLIMBS_M_S:
             return True
         return demand.velocity[2] < -CLIMBS_M_S or demand.position[2] < above

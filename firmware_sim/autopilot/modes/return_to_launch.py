@@ -11,15 +11,13 @@ from collections.abc import Callable
 from enum import Enum, auto
 
 from airl_mav.control.demand import AnyDemand
-from airl_mav.core.constants import DEG, US_PER_S
-from airl_mav.core.frames import Vector
+from airl_mav.core import constants, frames
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes import interface
-from firmware_sim.autopilot.modes.automatic import landing_speed
+from firmware_sim.autopilot.modes import automatic, interface
 from firmware_sim.autopilot.smooth_trajectory import PathSegment, triple
 
 _REQUIRED = 2
@@ -63,7 +61,7 @@ class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
             return north, east, self._down
         return north, east, ground if self._stage is _Stage.LAND else self._waiting_down
 
-    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
+    def enter(self, state: frames.Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start with the climb, if needed."""
         context = self._context
         home = interface.PositionYaw(context.home, context.home_yaw)
@@ -86,7 +84,7 @@ class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
         if context.armed:  # Disarmed, nothing is flown or reported.
             context.say(OperatorText(Severity.INFO, text, event))
 
-    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+    def demand(self, state: frames.Vector, time_us: int, /) -> AnyDemand:
         """Return the demand of the current stage, and advance stages."""
         if self._instead is None:
             self._go_on(state, time_us)
@@ -103,7 +101,7 @@ class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
             return travel.fly(state, time_us, PathSegment((north, east, self._down)), yaw=yaw)
         if self._stage is _Stage.LAND:
             context = self._context
-            speed = landing_speed(context.value, self._height(state), context.ground_m)
+            speed = automatic.landing_speed(context.value, self._height(state), context.ground_m)
             leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
             return travel.fly(state, time_us, leg, yaw=self._home.yaw)
         leg = PathSegment((north, east, self._waiting_down))
@@ -114,7 +112,7 @@ class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
         """Waiting height before landing, NED [m]."""
         return max(self._down, self._home.position[2] - self._context.value("RTL_DESCEND_ALT"))
 
-    def _go_on(self, state: Vector, time_us: int) -> None:
+    def _go_on(self, state: frames.Vector, time_us: int) -> None:
         """Select the next stage when the current one has ended."""
         value, down = self._context.value, triple(state, P)[2]
         radius = value("NAV_MC_ALT_RAD")
@@ -132,11 +130,11 @@ class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
             if delay < 0.0:
                 self._context.say(OperatorText.of(Severity.INFO, events.RTL_LOITERING))
         elif self._stage is _Stage.WAIT and self._waiting_since_us is not None:
-            waited_s = (time_us - self._waiting_since_us) / US_PER_S
+            waited_s = (time_us - self._waiting_since_us) / constants.US_PER_S
             if 0.0 <= delay <= waited_s:
                 self._land(state)
 
-    def _land(self, state: Vector) -> None:
+    def _land(self, state: frames.Vector) -> None:
         """Land, on a landing target if RTL_PLD_MD requires it."""
         self._stage = _Stage.LAND
         option = round(self._context.value("RTL_PLD_MD"))
@@ -150,11 +148,11 @@ class ReturnToLaunch(interface.FlightMode, modes=(Mode.RETURN,)):
             self._context.say(OperatorText(Severity.CRITICAL, text))
         self._context.say(OperatorText.of(Severity.INFO, events.RTL_LAND))
 
-    def _height(self, state: Vector) -> float:
+    def _height(self, state: frames.Vector) -> float:
         """Return the height above the landing place [m]."""
         return self._home.position[2] - state.item(P + 2)
 
-    def _away(self, state: Vector) -> float:
+    def _away(self, state: frames.Vector) -> float:
         """Return the horizontal distance from home [m]."""
         (north, east, _), home = triple(state, P), self._home.position
         return math.hypot(north - home[0], east - home[1])
@@ -180,7 +178,7 @@ def return_height(value: Callable[[str], float], height_m: float, away_m: float)
     else:
         target_m = highest
         if away_m <= value("RTL_MIN_DIST"):
-            target_m = min(highest, away_m / math.tan(min(89.0, max(1.0, angle)) * DEG))
+            target_m = min(highest, away_m / math.tan(min(89.0, max(1.0, angle)) * constants.DEG))
         target_m = max(target_m, 2.0 * radius)
     return max(height_m, min(target_m, highest))
 

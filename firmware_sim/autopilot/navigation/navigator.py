@@ -14,8 +14,7 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.failsafes.failsafe_conditions import FenceBreach
-from firmware_sim.autopilot.failsafes.watch import Reports
+from firmware_sim.autopilot.failsafes import failsafe_conditions, watch
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.guidance import Home
 from firmware_sim.autopilot.modes.interface import (
@@ -26,8 +25,7 @@ from firmware_sim.autopilot.modes.interface import (
     here,
 )
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
-from firmware_sim.autopilot.navigation import plan
-from firmware_sim.autopilot.navigation.geofence import FenceMonitor
+from firmware_sim.autopilot.navigation import geofence, plan
 from firmware_sim.autopilot.sensor_monitor import NewestSensors
 from firmware_sim.autopilot.smooth_trajectory import triple
 
@@ -49,7 +47,7 @@ class Navigator:
     def __init__(self, plans: plan.Plans, value: Callable[[str], float], crew: plan.Crew) -> None:
         """Store the plans, the look-up for PX4 parameters, and the mission callbacks."""
         self._value, self._crew = value, crew
-        self.fence = FenceMonitor(plans, value, crew.say)
+        self.fence = geofence.FenceMonitor(plans, value, crew.say)
         """Fence monitor."""
         self.missions = plan.Missions()
         """Missions, by an add-on."""
@@ -95,10 +93,10 @@ class Navigator:
             return None
         return home if goal == now.home else PositionYaw(now.local(goal), home.yaw)
 
-    def tell(self, context: FlightContext, reports: Reports) -> None:
+    def tell(self, context: FlightContext, reports: watch.Reports) -> None:
         """Update the reports to the failsafes."""
         missions = self.missions
-        reports.fence = FenceBreach(*self.fence.status.breached)
+        reports.fence = failsafe_conditions.FenceBreach(*self.fence.status.breached)
         reports.mission_missing, reports.mission_finished = not missions.valid, missions.over
         if self._value("BAT1_CAPACITY") > 0.0 and self._position is not None:
             reports.return_time_s = self._return_time_s(context, self._position)

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
-from airl_mav.core.constants import EARTH_RADIUS_M
-from airl_mav.core.frames import Geodetic, geodetic_to_local
+from airl_mav.core import constants, frames
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import OperatorText
-from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.autopilot import autopilot_state, flight_modes
 
 
 class MissionType(IntEnum):
@@ -62,10 +60,10 @@ class PlanItem:
         """True if the altitude is relative to home."""
         return self.frame in _RELATIVE
 
-    def place(self, home_altitude_m: float) -> Geodetic:
+    def place(self, home_altitude_m: float) -> frames.Geodetic:
         """Return the item's place for a home altitude above mean sea level [m]."""
         above = home_altitude_m if self.altitude_is_relative else 0.0
-        return Geodetic(self.x, self.y, self.z + above)
+        return frames.Geodetic(self.x, self.y, self.z + above)
 
 
 class Stored(NamedTuple):
@@ -152,7 +150,7 @@ def distance_m(a: tuple[float, float], b: tuple[float, float]) -> float:
     half_lat = math.sin(0.5 * (lat_b - lat_a))
     half_lon = math.sin(0.5 * math.radians(b[1] - a[1]))
     h = half_lat * half_lat + half_lon * half_lon * math.cos(lat_a) * math.cos(lat_b)
-    return EARTH_RADIUS_M * 2.0 * math.atan2(math.sqrt(h), math.sqrt(max(0.0, 1.0 - h)))
+    return constants.EARTH_RADIUS_M * 2.0 * math.atan2(math.sqrt(h), math.sqrt(max(0.0, 1.0 - h)))
 
 
 class NavigationState(NamedTuple):
@@ -164,25 +162,25 @@ class NavigationState(NamedTuple):
     yaw: float
     """Heading [rad]."""
     landed: bool
-    home: Geodetic
-    origin: Geodetic
+    home: frames.Geodetic
+    origin: frames.Geodetic
     """Geodetic origin of local NED."""
     velocity: Vec = (0.0, 0.0, 0.0)
     """NED [m/s]."""
 
-    def local(self, place: Geodetic) -> Vec:
+    def local(self, place: frames.Geodetic) -> Vec:
         """Return a place in local NED [m]."""
-        north, east, down = geodetic_to_local(place, self.origin).tolist()
+        north, east, down = frames.geodetic_to_local(place, self.origin).tolist()
         return north, east, down
 
 
 class Crew(Protocol):
     """Callbacks for mission commands other than flight."""
 
-    def say(self, message: OperatorText, /) -> None:
+    def say(self, message: autopilot_state.OperatorText, /) -> None:
         """Send a text to the operator."""
 
-    def set_home(self, place: Geodetic | None, /) -> object:
+    def set_home(self, place: frames.Geodetic | None, /) -> object:
         """Move home; None = the current position."""
 
     def return_to_launch(self) -> None:
@@ -205,12 +203,12 @@ class Missions:
     def review(self, _now: NavigationState, /) -> None:
         """Check the mission after a change of mission, fence or home."""
 
-    def step(self, _now: NavigationState, _mode: Mode, /, *, armed: bool) -> None:
+    def step(self, _now: NavigationState, _mode: flight_modes.Mode, /, *, armed: bool) -> None:
         """Advance by a period of the navigator."""
 
-    def destination(self, now: NavigationState, /) -> Geodetic | None:
+    def destination(self, now: NavigationState, /) -> frames.Geodetic | None:
         """Return the destination of Return at ground altitude; None = along mission items."""
         return now.home
 
-    def look_at(self, _place: Geodetic | None, /) -> None:
+    def look_at(self, _place: frames.Geodetic | None, /) -> None:
         """Set the region of interest; None = clear it."""

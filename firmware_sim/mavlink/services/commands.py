@@ -19,14 +19,13 @@ from firmware_sim.autopilot.events.definition import NavigationMode
 from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.modes.interface import OrbitRequest, PositionYaw, Reposition
-from firmware_sim.mavlink import services
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink import codec, services
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 NAN = math.nan
 
-_CHANGE_MODE: int = dialect.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
-_GROUND_SPEED: int = dialect.SPEED_TYPE_GROUNDSPEED
+_CHANGE_MODE: int = codec.dialect.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
+_GROUND_SPEED: int = codec.dialect.SPEED_TYPE_GROUNDSPEED
 
 _LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
 """Range of valid origin altitudes above mean sea level, as in EKF2 [m]."""
@@ -100,7 +99,7 @@ def _set_home(command: services.VehicleCommand, context: services.Context) -> Re
     return context.port.set_home(place)
 
 
-def handle_set_origin(message: WireMessage, context: services.Context) -> bool:
+def handle_set_origin(message: codec.WireMessage, context: services.Context) -> bool:
     """Handle SET_GPS_GLOBAL_ORIGIN: move the origin of local NED.
 
     Requires this system id and a valid position. Like PX4 1.16, always reply GPS_GLOBAL_ORIGIN.
@@ -129,8 +128,8 @@ TERMINATE_FROM = 0.5
 _PARAMS = attrgetter(*(f"param{number}" for number in range(1, 8)))
 
 _RELATIVE_FRAMES = (
-    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+    codec.dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    codec.dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
 )
 
 
@@ -179,9 +178,9 @@ def _change_mode(base: int, main: int, sub: int, context: services.Context) -> R
 
 def _set_standard_mode(command: services.VehicleCommand, context: services.Context) -> Result:
     """Handle DO_SET_STANDARD_MODE, parameter 1: MAV_STANDARD_MODE; FAILED if unsupported."""
-    asked, custom = command.integer(1) or 0, dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    asked, custom = command.integer(1) or 0, codec.dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     # NON_STANDARD is 0, also the value of an unset parameter.
-    if asked != dialect.MAV_STANDARD_MODE_NON_STANDARD:
+    if asked != codec.dialect.MAV_STANDARD_MODE_NON_STANDARD:
         for mode in Mode:
             if mode.spec.standard == asked:
                 return _change_mode(custom, mode.spec.main, mode.spec.sub, context)
@@ -215,30 +214,30 @@ def _mode(mode: Mode) -> services.Action:
     return lambda _, context: context.port.set_mode(mode, commanded=True)
 
 
-_REQUEST_CAPABILITIES: int = dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
-_REQUEST_PROTOCOL: int = dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION
+_REQUEST_CAPABILITIES: int = codec.dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
+_REQUEST_PROTOCOL: int = codec.dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION
 
 ACTIONS: dict[int, services.Action] = {
-    dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
-    dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
-    dialect.MAV_CMD_NAV_LAND: _mode(Mode.LAND),
-    dialect.MAV_CMD_NAV_LAND_LOCAL: _mode(Mode.PRECISION_LAND),
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _mode(Mode.RETURN),
-    dialect.MAV_CMD_DO_SET_MODE: _set_mode,
-    dialect.MAV_CMD_DO_SET_STANDARD_MODE: _set_standard_mode,
-    dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
-    dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
-    dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
-    dialect.MAV_CMD_DO_REPOSITION: _reposition,
-    dialect.MAV_CMD_DO_CHANGE_ALTITUDE: _change_altitude,
-    dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
-    dialect.MAV_CMD_DO_ORBIT: _orbit,
-    dialect.MAV_CMD_DO_SET_HOME: _set_home,
+    codec.dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
+    codec.dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
+    codec.dialect.MAV_CMD_NAV_LAND: _mode(Mode.LAND),
+    codec.dialect.MAV_CMD_NAV_LAND_LOCAL: _mode(Mode.PRECISION_LAND),
+    codec.dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _mode(Mode.RETURN),
+    codec.dialect.MAV_CMD_DO_SET_MODE: _set_mode,
+    codec.dialect.MAV_CMD_DO_SET_STANDARD_MODE: _set_standard_mode,
+    codec.dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
+    codec.dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
+    codec.dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
+    codec.dialect.MAV_CMD_DO_REPOSITION: _reposition,
+    codec.dialect.MAV_CMD_DO_CHANGE_ALTITUDE: _change_altitude,
+    codec.dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
+    codec.dialect.MAV_CMD_DO_ORBIT: _orbit,
+    codec.dialect.MAV_CMD_DO_SET_HOME: _set_home,
 }
 """Actions by command. Commands without an action in any service are UNSUPPORTED."""
 
 
-def handle_command_long(message: WireMessage, context: services.Context) -> bool:
+def handle_command_long(message: codec.WireMessage, context: services.Context) -> bool:
     """Execute and acknowledge a COMMAND_LONG."""
     return _handle(
         services.VehicleCommand(message.command, _PARAMS(message), services.sender(message)),
@@ -246,7 +245,7 @@ def handle_command_long(message: WireMessage, context: services.Context) -> bool
     )
 
 
-def handle_command_int(message: WireMessage, context: services.Context) -> bool:
+def handle_command_int(message: codec.WireMessage, context: services.Context) -> bool:
     """Execute and acknowledge a COMMAND_INT."""
     # COMMAND_INT has five floats and a position in 1e-7 degrees.
     four = (message.param1, message.param2, message.param3, message.param4)
@@ -259,7 +258,7 @@ def handle_command_int(message: WireMessage, context: services.Context) -> bool:
     )
 
 
-def handle_set_mode(message: WireMessage, context: services.Context) -> bool:
+def handle_set_mode(message: codec.WireMessage, context: services.Context) -> bool:
     """Execute a SET_MODE, the legacy message without acknowledgement."""
     if message.target_system != context.system_id:
         return False
@@ -275,12 +274,12 @@ def _handle(command: services.VehicleCommand, context: services.Context) -> bool
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:
         context.link.send(
-            dialect.MAVLink_command_ack_message(command.number, result, 0, 0, *command.sender)
+            codec.dialect.MAVLink_command_ack_message(command.number, result, 0, 0, *command.sender)
         )
     return True
 
 
-def is_addressed(message: WireMessage, context: services.Context) -> bool:
+def is_addressed(message: codec.WireMessage, context: services.Context) -> bool:
     """Return True if a command is for this vehicle. Identity requests may be broadcasts."""
     if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
         return message.target_system in (context.system_id, services.ANY)
@@ -320,7 +319,7 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None
     The parameters are MAV_MODE_FLAG bits, main mode and sub mode. A message is PX4's explanation of
     an unavailable mode. None: PX4 accepts the request without effect (unknown main mode).
     """
-    if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+    if not base & codec.dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         # Clients without custom modes describe the mode by bits.
         return _from_base_mode(base)
     # PX4 treats an unknown sub mode of POSCTL as Position.
@@ -330,13 +329,13 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | OperatorText | None
 
 def _from_base_mode(base: int) -> Mode | None:
     """Return the mode that PX4 derives from the bits of clients without custom modes."""
-    if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
+    if base & codec.dialect.MAV_MODE_FLAG_AUTO_ENABLED:
         return Mode.MISSION
-    if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
+    if not base & codec.dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
         return None
-    if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
+    if base & codec.dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
         return Mode.POSITION
-    return Mode.STABILIZED if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL
+    return Mode.STABILIZED if base & codec.dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else Mode.MANUAL
 
 
 HANDLERS: services.Handlers = {

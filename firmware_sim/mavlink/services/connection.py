@@ -14,8 +14,7 @@ from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result,
 from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
 from firmware_sim.mavlink.message_rates import OFF
-from firmware_sim.mavlink.streams import Builder
-from firmware_sim.mavlink.streams.units import INT32_MAX
+from firmware_sim.mavlink.streams import Builder, units
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
 
 _INTERVAL_UNAVAILABLE = 0
@@ -45,7 +44,7 @@ def _set_message_interval(command: services.VehicleCommand, context: services.Co
         interval_us = OFF
     elif interval > 0.0:
         # The upper limit keeps the value in the reply's int32 field; 1 µs is sent every tick.
-        interval_us = max(1, round(min(interval, INT32_MAX)))
+        interval_us = max(1, round(min(interval, units.INT32_MAX)))
     else:
         interval_us = scheduler.default_us(name)
     scheduler.set_interval(name, interval_us, context.now_us)

@@ -12,8 +12,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from airl_mav.core.addons import entries
-from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local, local_to_geodetic
+from airl_mav.core import addons, frames
 from firmware_sim.autopilot import flight_modes
 from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Landed
 from firmware_sim.autopilot.modes.return_to_launch import return_time_s
@@ -34,7 +33,7 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
-    | sum(entries("firmware_sim", "CAPABILITIES").values())
+    | sum(addons.entries("firmware_sim", "CAPABILITIES").values())
 )
 """Capabilities, with all add-ons equal to a real PX4's 0xE8FF."""
 
@@ -300,7 +299,7 @@ def time_estimate_to_target(state: AutopilotState, value: Callable[[str], float]
     took = 0.0
     # On the ground the return takes no time.
     if state.status.landed is not Landed.ON_GROUND:
-        target = geodetic_to_local(home, origin).tolist()
+        target = frames.geodetic_to_local(home, origin).tolist()
         north, east, down = (
             b - a for a, b in zip(target, state.estimate.position.tolist(), strict=True)
         )
@@ -324,7 +323,7 @@ def orbit_execution_status(state: AutopilotState) -> Values | None:
     orbit, origin = state.orbit, state.origin
     if orbit is None or origin is None:
         return None
-    centre = local_to_geodetic(np.array(orbit.centre), origin)
+    centre = frames.local_to_geodetic(np.array(orbit.centre), origin)
     return (
         state.time_us,
         orbit.radius_m,
@@ -344,7 +343,7 @@ def home_position(state: AutopilotState) -> Values | None:
     local = (
         [math.nan, math.nan, math.nan]
         if origin is None
-        else geodetic_to_local(home, origin).tolist()
+        else frames.geodetic_to_local(home, origin).tolist()
     )
     return *_wire(home), *local, *_level(state.home_yaw), *_NO_APPROACH, state.time_us
 
@@ -354,7 +353,7 @@ def gps_global_origin(state: AutopilotState) -> Values | None:
     return None if state.origin is None else (*_wire(state.origin), state.time_us)
 
 
-def _wire(place: Geodetic) -> Values:
+def _wire(place: frames.Geodetic) -> Values:
     """Return latitude, longitude [degE7] and altitude [mm]."""
     return (
         units.deg_e7(place.latitude_deg),
@@ -384,7 +383,7 @@ def hil_state_quaternion(truth: TrueState, time_us: int) -> Values:
         truth: True state.
         time_us: Time stamp on the receiver's clock [µs].
     """
-    place = local_to_geodetic(truth.position, HOME)
+    place = frames.local_to_geodetic(truth.position, frames.HOME)
     return (
         time_us,
         *truth.quaternion.tolist(),
