@@ -31,7 +31,7 @@ while True:  # the estimator needs some seconds before the vehicle may be armed
         time.sleep(0.5)
 action.set_takeoff_altitude(3.0)
 action.takeoff()
-while telemetry.position_velocity_ned().position.down_m > -2.7:
+while not telemetry.position_velocity_ned().position.down_m < -2.7:  # NaN until the first message
     time.sleep(0.1)
 
 offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
