@@ -4,7 +4,6 @@
     python scripts/gallery.py --pages   # writes the pages only, from profiles and policy cards
 
 The commands under the pictures are the ones that draw them.
-Also draws docs/images/hardware-gap.png.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from pathlib import Path
 from PIL import Image
 
 from airl_mav import Scenario, rehearse
-from airl_mav.arena.draw import draw_arena
 from airl_mav.cli import main as commands
 from airl_mav.core.files import replace_file
 from airl_mav.policy.registry import find_policy, policy_names
@@ -29,22 +27,16 @@ from airl_mav.profiles import loading
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import arena_of, load
-from airl_mav.report import run_figures, theme
+from airl_mav.report import run_figures
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ROOT / "docs" / "gallery"
 PICTURES = ROOT / "docs" / "images" / "gallery"
 
 SEED = 7
-GAP = Scenario(policy="static-obstacles", workload="template-5x32", level="gym", episodes=1, seed=7)
+
 WIDTH_PX = 480
 COLOURS = 128
-
-COMPUTERS = {
-    "workstation": ("workstation, 11 ms", theme.SERIES),
-    "ras-pi-4": ("Raspberry Pi 4, 396 ms", theme.MARK),
-}
-"""Labels and colours of the paths in the picture of the hardware gap."""
 
 
 @dataclass(frozen=True)
@@ -190,27 +182,6 @@ def draw_flight(scenario: Scenario, path: Path) -> None:
     shrink(path)
 
 
-def draw_gap(path: Path) -> None:
-    """Write the paths of one seed, decided by a workstation and by a Raspberry Pi 4."""
-    figure = theme.new_figure(6.4, 5.6)
-    ax = figure.add_subplot()
-    for computer, (name, colour) in COMPUTERS.items():
-        run = load(rehearse(GAP.model_copy(update={"computer": computer})).path)
-        episode = run.episodes[0]
-        trajectory = run.trajectories[episode.index]
-        arena = arena_of(run, episode)
-        if arena is not None and not ax.patches:
-            draw_arena(arena, ax, goal_radius_m=episode.goal_radius_m)
-        quality = episode.quality
-        assert quality is not None
-        label = f"{name}: {quality.distance_m:.0f} m, {quality.flight_time_s:.1f} s"
-        ax.plot(trajectory.position[:, 1], trajectory.position[:, 0], color=colour, label=label)
-    theme.plain_axes(ax, grid=False)
-    theme.label_axes(ax, "east [m]", "north [m]")
-    theme.legend_below(figure, 1)
-    path.write_bytes(theme.render_png(figure))
-
-
 def shrink(path: Path) -> None:
     """Rewrite a picture at the width of the page, with a palette."""
     image = Image.open(path).convert("RGB")
@@ -236,8 +207,6 @@ def main() -> None:
                     if not (PICTURES / file).exists():
                         print(file, flush=True)
                         draw(PICTURES / file)
-    if not options.pages:
-        draw_gap(PICTURES.parent / "hardware-gap.png")
 
 
 if __name__ == "__main__":
