@@ -1,19 +1,18 @@
-"""Compare two runs over pairs of flights: `static-obstacles` in calm air and in wind.
+"""Compare two policies on the same seeds: differences over pairs of flights.
 
 The vectorized simulator flies them in seconds. `level="lockstep"` uses MAVLink and MAVSDK.
 """
 
 from airl_mav import Scenario, rehearse
-from airl_mav.profiles.vehicle import WindSettings
 from airl_mav.report.comparison.show import compare_folders
 
-calm = rehearse(Scenario(level="gym", episodes=20), out="runs/calm")
-windy = rehearse(
-    Scenario(level="gym", episodes=20, wind=WindSettings(east_m_s=4.0, gust_m_s=1.5)),
-    out="runs/windy",
-)
+policies = ["static-obstacles", "static-obstacles-fast"]
+folders = [
+    rehearse(Scenario(policy=policy, level="gym", episodes=20), out=f"runs/{policy}").path
+    for policy in policies
+]
 
-comparison, _ = compare_folders([calm.path, windy.path], ["calm", "windy"])
+comparison, _ = compare_folders(folders, policies)
 (contrast,) = comparison.contrasts
 for name in "flight_time_s", "distance_m", "energy_j":
     change = getattr(contrast.paired, name).difference
@@ -21,4 +20,4 @@ for name in "flight_time_s", "distance_m", "energy_j":
         f"{name:13}  {change.value:+6.1f} %  [{change.low:+.1f}, {change.high:+.1f}]"
         f"  over {change.n} pairs"
     )
-print("the whole page: airl report runs/calm runs/windy")
+print(f"the whole page: airl report {' '.join(f'runs/{policy}' for policy in policies)}")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from airl_mav.addons.airframe_check.airframe_check import check_airframe
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.flight.judge import Outcome
@@ -28,6 +30,8 @@ from tests.support.processes import ROOT, running
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("examples"), pytest.mark.timeout(600)]
 
 EXAMPLES = ROOT / "examples"
+
+AIRL = "from airl_mav.cli.main import airl; airl()"
 
 
 def output_of(name: str, folder: Path, *arguments: str) -> str:
@@ -49,6 +53,12 @@ def test_every_example_is_flown() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} <= named
 
 
+def test_every_example_is_on_a_page() -> None:
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
+    for path in EXAMPLES.iterdir():
+        assert f"examples/{path.name}" in pages, path.name
+
+
 @pytest.mark.nightly
 def test_rehearse(tmp_path: Path) -> None:
     text = output_of("rehearse.py", tmp_path)
@@ -62,11 +72,11 @@ def test_rehearse(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-def test_faults_are_told(tmp_path: Path) -> None:
+def test_faults_are_listed(tmp_path: Path) -> None:
     text = output_of("faults.py", tmp_path)
     assert "healthy: success" in text
-    assert "  camera stuck at offboard+0.5s for 0.5s: 0.50 s" in text
-    assert "  uplink loss 0.3 at offboard" in text
+    assert "  gps bias 20,0,0m at offboard+1s for 5s: " in text
+    assert "  gps delay 0.8s at offboard: " in text
 
 
 @pytest.mark.nightly  # Policies from a file: test_python_policy.py.
@@ -151,6 +161,56 @@ def test_compare_runs(tmp_path: Path) -> None:
     changes = numbers_after(r"^\w+ +([+-][\d.]+) %  \[[+-].*\]  over (\d+) pairs$", text)
     assert len(changes) == 6
     assert max(abs(change) for change in changes[::2]) < 50.0
+
+
+def test_failed_flight_names_causes(tmp_path: Path) -> None:
+    text = output_of("failed_flight.py", tmp_path)
+    assert re.search(r"^flight \d+, hit static-\S+: seen ", text, re.M)
+    assert "circled" in text
+
+
+def test_own_computer_replays_its_file(tmp_path: Path) -> None:
+    text = output_of("own_computer.py", tmp_path)
+    means = numbers_after(r": t2 (\d+) ms, at most (\d+) ms; success", text)
+    latencies = [float(line) for line in (tmp_path / "my-computer.txt").read_text().split()]
+    assert means[:2] == [1.0, 1.0]
+    assert means[3] <= round(max(latencies))
+    assert means[2] == pytest.approx(np.mean(latencies), rel=0.1)
+
+
+def test_export_pandas(tmp_path: Path) -> None:
+    text = output_of("export_pandas.py", tmp_path)
+    rows = re.findall(r"^\d +\d +success +\d+ +([\d.]+) +[\d.]+$", text, re.M)
+    assert [float(mean) for mean in rows] == pytest.approx([150.0] * 3, rel=0.1)
+
+
+@pytest.mark.nightly  # It exports a network; the export itself: test_export.py.
+def test_sb3_model(tmp_path: Path) -> None:
+    text = output_of("sb3_model.py", tmp_path)
+    assert (tmp_path / "my-policy/card.json").is_file()
+    assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2
+
+
+def test_the_7_inch_quad_has_fitting_gains() -> None:
+    figures = check_airframe(str(EXAMPLES / "quad-7-inch.toml"))
+    assert figures.warnings == ()
+    assert figures.thrust_to_weight == pytest.approx(4.97, abs=0.01)
+
+
+def test_the_workflow_passes_with_a_shipped_policy(tmp_path: Path) -> None:
+    """The command of the workflow, without the latency, in the vectorized simulator."""
+    text = (EXAMPLES / "rehearsal.yml").read_text(encoding="utf-8")
+    found = re.search(r"airl (evaluate .*?)\n      - ", text, re.S)
+    assert found is not None
+    words = shlex.split(found[1])
+    for old, new in (("policies/mine", "static-obstacles"), ("lockstep", "gym"), ("300", "80")):
+        words[words.index(old)] = new
+    for option in ("--computer", "--workload"):
+        del words[words.index(option) : words.index(option) + 2]
+    with running(["-c", AIRL, *words], tmp_path) as program:
+        assert program.wait(280.0) == 0, program.text()
+    assert (tmp_path / "runs/ci/junit.xml").is_file()
+    assert (tmp_path / "runs/ci/rehearsal.svg").is_file()
 
 
 def test_gymnasium_loop(tmp_path: Path) -> None:
