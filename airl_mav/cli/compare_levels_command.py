@@ -8,8 +8,8 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
+from airl_mav.cli.shared_options import ExperimentOptions, episodes, fly_and_show
 from airl_mav.core.fields import COMMON, quantity
 from airl_mav.experiments.evaluate import LEVELS, declare_compare_levels, training_arena
 from airl_mav.policy.registry import find_policy

@@ -9,9 +9,18 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.cli.shared_options import Gate, Viewing, Voice, leave, requirements_of, view_of
+from airl_mav.cli.shared_options import (
+    ExperimentOptions,
+    Gate,
+    Viewing,
+    Voice,
+    episodes,
+    fly_and_show,
+    leave,
+    requirements_of,
+    view_of,
+)
 from airl_mav.core import errors, fields
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import OnboardOptions, episodes, fly_and_show
 from airl_mav.cli.options import scenario_of
+from airl_mav.cli.shared_options import OnboardOptions, episodes, fly_and_show
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.hardware_gap import (
     DEFAULT_MITIGATED,

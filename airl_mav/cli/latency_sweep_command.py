@@ -8,9 +8,8 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.cli.shared_options import Gate
+from airl_mav.cli.shared_options import ExperimentOptions, Gate, episodes, fly_and_show
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.evaluate import LATENCIES, declare_latency_sweep
 from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY, ArenaName

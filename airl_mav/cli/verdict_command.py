@@ -8,9 +8,15 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import OnboardOptions, episodes
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
-from airl_mav.cli.shared_options import Gate, Voice, leave, requirements_of
+from airl_mav.cli.shared_options import (
+    Gate,
+    OnboardOptions,
+    Voice,
+    episodes,
+    leave,
+    requirements_of,
+)
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments import hardware_gap, live
 from airl_mav.flight.requirements import LOOKS

@@ -16,8 +16,8 @@ from common import StudyConfig, StudyOptions, find_or_train, study
 from pydantic import Field, create_model
 from rich.console import Console
 
-from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.cli.shared_options import fly_and_show
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.progress import new_console
 from airl_mav.experiments.experiment import Experiment, make_cell

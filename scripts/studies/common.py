@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 from rich.console import Console
 
 from airl_mav.cli import train_command
-from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.shared_options import fly_and_show
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.experiments.experiment import Experiment

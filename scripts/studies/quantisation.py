@@ -16,8 +16,8 @@ from pydantic import Field, create_model
 from rich.console import Console
 
 from airl_mav.addons.int8.quantisation import export_int8
-from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.cli.shared_options import fly_and_show
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import new_console
 from airl_mav.experiments.evaluate import training_arena

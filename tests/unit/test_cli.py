@@ -13,10 +13,9 @@ import tyro
 
 from airl_mav import __version__
 from airl_mav.cli import main as entry
-from airl_mav.cli.help_texts import options_in
 from airl_mav.cli.list_command import KINDS
 from airl_mav.cli.main import GROUPS, main, subcommands
-from airl_mav.cli.options import _arguments
+from airl_mav.cli.options import _arguments, options_in
 from airl_mav.core import fields
 from airl_mav.core.errors import PAGE
 from airl_mav.policy.registry import policy_names
