@@ -16,7 +16,6 @@ pytest.importorskip("onnxscript", reason="needs the [train] extra")
 import onnx
 
 from airl_mav.core.errors import UsageError
-from airl_mav.policy import card_writing
 from airl_mav.policy.card import (
     MeasuredResult,
     PolicyCard,
@@ -277,7 +276,7 @@ def test_a_kill_between_policy_and_card_leaves_no_card_for_the_wrong_policy(
     def killed(path: Path, data: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(card_writing, "write_json", killed)
+    monkeypatch.setattr("airl_mav.core.files.write_json", killed)
     with pytest.raises(KeyboardInterrupt):
         export_tiny(folder, "PPO", name="other")
     monkeypatch.undo()
