@@ -46,7 +46,7 @@ OBJECT = re.compile(r"^::: ([\w.]+)\n(?: .*\n|\n(?= ))*(?:\n<!-- fields: .* -->\
 PARTS = {COMMANDS: "reference/commands/{}.md", API: "reference/api/{}.md"}
 """Pages of parts, by the page that lists them."""
 
-HELP_COLUMNS = "100"
+HELP_COLUMNS = "84"
 """Width of wrapped help texts."""
 
 _WHERE = re.compile(r"([\w.]+):(\w+)(?:\[(.+)\]\.(\w+))?")
