@@ -3,7 +3,7 @@
     python scripts/gallery.py           # writes docs/gallery/*.md and missing pictures
     python scripts/gallery.py --pages   # writes the pages only, from profiles and policy cards
 
-The commands under the pictures are the ones that draw them.
+Each part has one command; pictures are drawn by that or by `airl render`.
 """
 
 from __future__ import annotations
@@ -156,7 +156,8 @@ def page(title: str, introduction: str, entries: Iterable[Entry]) -> str:
             f"![{entry.name}](../images/gallery/{file}){{ width=360 }}" for file in entry.pictures
         )
         description = entry.description[0].upper() + entry.description[1:]
-        lines = "\n".join(entry.commands)
+        # The first command shows the part; the others draw its pictures.
+        lines = entry.commands[0]
         parts.append(
             f"## {entry.name}\n\n{description}. {entry.facts}\n\n{images}\n\n```sh\n{lines}\n```"
         )

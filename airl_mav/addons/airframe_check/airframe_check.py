@@ -214,7 +214,7 @@ def _warnings(profile: VehicleProfile, found: AirframeFigures) -> list[str]:
 class VehicleOptions(fields.ProfileModel):
     """Show the figures of an aircraft before it flies.
 
-    Step responses are those of the built-in flight controller with the profile's gains.
+    Step responses use the built-in flight controller with the profile's gains.
 
     Examples:
         airl vehicle quad

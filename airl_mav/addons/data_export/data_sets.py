@@ -69,7 +69,7 @@ def sampled(run: LoadedRun, rate_hz: float) -> Iterator[SampledEpisode]:
 def write_minari(run: LoadedRun, rate_hz: float, out: Path) -> int:
     """Write a Minari data set; return the number of episodes.
 
-    The reward is 1 for the step that reaches the goal. Its name is that of the folder, `-v0` added;
+    The reward is 1 for the step that reaches the goal. The data set is named FOLDER-v0;
     `MINARI_DATASETS_PATH` is the parent folder.
     """
     buffers = []
