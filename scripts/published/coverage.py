@@ -42,6 +42,12 @@ def not_covered() -> tuple[NotCovered, ...]:
     return tuple(validated(NotCovered, each, NOT_COVERED_FILE) for each in data["figure"])
 
 
+def off_the_pages() -> set[str]:
+    """Return the names of the results that no page shows, as listed."""
+    data = tomllib.loads(NOT_COVERED_FILE.read_text(encoding="utf-8"))
+    return {*data["off_the_pages"]}
+
+
 def plain(text: str) -> str:
     """Return a page without its blocks and line breaks: the text written by hand."""
     return " ".join(MARKED.sub("", text).split())

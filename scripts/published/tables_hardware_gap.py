@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 from airl_mav.profiles.loading import PublishedRun, PublishedTable, load_published, published_gap
 from published.blocks import DEFAULT, Records, Render, block
-from published.record import MEASURES, Figure, FlownRun, Gap, Record
+from published.record import MEASURES, FlownRun, Gap, Record
 from published.text import (
-    NONE,
     both,
     change,
     energy_kj,
@@ -126,17 +125,6 @@ SAME_PERCENT = 0.05
 """Maximum difference of gaps [%] that count as equal to the printed ones."""
 
 
-@block("hardware-gap-lockstep", "hardware-gap-lockstep")
-def hardware_gap_lockstep(records: Records) -> str:
-    rows = []
-    for title, target, reference in _GAPS[:-1]:
-        gap = _gap(records["hardware-gap-lockstep"], target, reference)
-        cells = (both(getattr(gap, measure), 1, "+") for measure in MEASURES)
-        rows.append((title.partition(" (")[0], *cells, f"{gap.flight_time_s.n}"))
-    heads = ("success [points]", "flight time [%]", "distance [%]", "energy [%]", "pairs")
-    return table(("gap at `lockstep`", *heads), rows, 5)
-
-
 @block("mitigation-gaps", "hardware-gap")
 def mitigation_gaps(records: Records) -> str:
     rows = []
@@ -148,41 +136,6 @@ def mitigation_gaps(records: Records) -> str:
             rows.append(("", *_told(target, reference), ""))
     heads = ("success [points]", "flight time [%]", "distance [%]", "energy [%]", "pairs")
     return table(("gap", "", *heads), rows, 5)
-
-
-@block("like-for-like", "like-for-like")
-def like_for_like(records: Records) -> str:
-    record = records["like-for-like"]
-    first = record.runs[f"{DEFAULT}-reference"]
-    gaps = [_gap(record, target, "reference") for target in _LIKE_FOR_LIKE]
-    late = [record.runs[f"{DEFAULT}-{target}"] for target in _LIKE_FOR_LIKE]
-    rows = [
-        (
-            "success",
-            f"{rate(first)} %",
-            *(
-                f"{rate(run)} %, {both(gap.success_rate, 1, '+')} points"
-                for run, gap in zip(late, gaps, strict=True)
-            ),
-        ),
-        (
-            "flight time",
-            f"{number(first.flight_time_s, 2)} s",
-            *(percent(gap.flight_time_s) for gap in gaps),
-        ),
-        (
-            "distance",
-            f"{number(first.distance_m, 2)} m",
-            *(percent(gap.distance_m) for gap in gaps),
-        ),
-        ("energy, vehicle", f"{energy_kj(first)} kJ", *(percent(gap.energy_j) for gap in gaps)),
-        ("pairs", "", *(f"{gap.flight_time_s.n}" for gap in gaps)),
-    ]
-    heads = ("undelayed, workstation", "undelayed, Ras-Pi 4", "... compensated in flight")
-    return table(("like for like", *heads, "mitigated, Ras-Pi 4"), rows, 4)
-
-
-_LIKE_FOR_LIKE = ("target", "compensated", "mitigated")
 
 
 @block("intervals", "hardware-gap", "hardware-gap-lockstep")
@@ -255,39 +208,6 @@ for _arena in ("no-obstacles", "static-obstacles", "dynamic-obstacles"):
     block(f"system-{_arena}", "system")(_system(_arena))
 
 
-@block("hover", "hover-static", "hover-dynamic", "hardware-gap", "system")
-def hover(records: Records) -> str:
-    rows = []
-    for title, record, arena, halt in (
-        ("static-obstacles, 396 ms", "hardware-gap", "static-obstacles", "hover-static"),
-        ("dynamic-obstacles, 949 ms", "system", "dynamic-obstacles", "hover-dynamic"),
-    ):
-        runs = records[record].runs
-        on, still = runs[f"{arena}-target"], records[halt].runs["run"]
-        undelayed = runs[f"{arena}-reference"]
-        rows.append((f"{title}: success", *(f"{rate(run)} %" for run in (on, still, undelayed))))
-        for name, field, unit in (
-            ("flight time", "flight_time_s", "s"),
-            ("distance", "distance_m", "m"),
-        ):
-            share = _share(getattr(still, field), getattr(undelayed, field))
-            rows.append(
-                (
-                    name,
-                    f"{number(getattr(on, field), 2)} {unit}",
-                    f"{number(getattr(still, field), 2)} {unit} ({share})",
-                    f"{number(getattr(undelayed, field), 2)} {unit}",
-                )
-            )
-    return table(("Ras-Pi 4", "last command flies on", "hover after 60 ms", "undelayed"), rows, 3)
-
-
-def _share(figure: Figure, reference: Figure) -> str:
-    if figure.value is None or not reference.value:
-        return NONE
-    return f"{100.0 * (figure.value - reference.value) / reference.value:+.0f} %"
-
-
 # --- roofline
 
 
@@ -296,77 +216,6 @@ def roofline(records: Records) -> str:
     printed = records["roofline"].printed
     assert printed is not None
     return table(printed.columns, printed.rows, 8)
-
-
-# --- compensation
-
-
-@block("compensation-model", "compensation-model")
-def compensation_model(records: Records) -> str:
-    printed = records["compensation-model"].printed
-    assert printed is not None
-    # Halved and doubled values of the response bound the intermediate ones.
-    between = ("x 0.75", "x 1.5")
-    rows = [
-        row
-        for row in printed.rows
-        if row[0].startswith("expected latency") or not row[0].endswith(between)
-    ]
-    return table(("396 ms", *printed.columns[1:]), rows, 3)
-
-
-_LATE = ("11ms", "150ms", "396ms", "542ms", "949ms")
-
-_WAYS = (
-    ("compensation", DEFAULT),
-    ("compensation", f"{DEFAULT}--compensated"),
-    ("compensation-pipelined", DEFAULT),
-)
-
-
-@block("compensation", "compensation", "compensation-pipelined")
-def compensation(records: Records) -> str:
-    rows = []
-    for late in _LATE:
-        cells: list[str] = []
-        for record, name in _WAYS:
-            run = records[record].runs[f"{name}-{late}"]
-            cells.append(f"{rate(run)} %")
-            cells.append(
-                f"{number(run.flight_time_s, 2)} s, {number(run.distance_m, 1)} m",
-            )
-        rows.append((late.replace("ms", " ms"), *cells))
-    heads = ("as it is", "", "compensated", "", "compensated, pipelined", "")
-    return table(("t2", *heads), rows, 6)
-
-
-@block("compensation-lockstep", "compensation-lockstep")
-def compensation_lockstep(records: Records) -> str:
-    record, rows = records["compensation-lockstep"], []
-    for late in ("11ms", "396ms"):
-        run = record.runs[f"{DEFAULT}-{late}"]
-        gap = record.gaps.get(f"{DEFAULT}-{late} against {DEFAULT}-11ms")
-        flown = f"{number(run.flight_time_s, 2)} s", f"{number(run.distance_m, 1)} m"
-        changes = (NONE, NONE, NONE)
-        if gap is not None:
-            points = both(gap.success_rate, 1, "+")
-            changes = points, percent(gap.flight_time_s), percent(gap.distance_m)
-        rows.append((late.replace("ms", " ms"), f"{rate(run)} %", *flown, *changes))
-    heads = ("success", "flight time", "distance", "points", "time", "distance against 11 ms")
-    return table(("t2", *heads), rows, 6)
-
-
-@block("any-latency", "any-latency")
-def any_latency(records: Records) -> str:
-    record, name = records["any-latency"], "static-obstacles-any-latency"
-    rows = []
-    for late in ("1ms", *_LATE):
-        run = record.runs[f"{name}-{late}"]
-        gap = record.gaps.get(f"{name}-{late} against {name}-1ms")
-        longer = NONE if gap is None else percent(gap.flight_time_s)
-        flown = f"{number(run.flight_time_s, 2)} s", f"{number(run.distance_m, 1)} m"
-        rows.append((late.replace("ms", " ms"), f"{rate(run)} %", *flown, longer))
-    return table(("t2", "success", "flight time", "distance", "time against 1 ms"), rows, 4)
 
 
 # --- degradation
@@ -378,28 +227,6 @@ _LATENCIES = (
     ("400 ms", "400ms"),
     ("950 ms", "950ms"),
 )
-
-
-_BY_RATES = {
-    "reference": "`body-rates`, 1 ms",
-    "target": "`body-rates`, 120 ms",
-    "mitigated": "`body-rates-120ms`, 120 ms",
-    "mitigated-reference": "`body-rates-120ms`, 1 ms",
-}
-
-
-@block("body-rates", "body-rates-hardware-gap", "body-rates-lockstep")
-def body_rates(records: Records) -> str:
-    rows = []
-    for role, title in _BY_RATES.items():
-        cells: list[str] = []
-        for record in ("body-rates-hardware-gap", "body-rates-lockstep"):
-            run = records[record].runs[f"no-obstacles-{role}"]
-            figures = f"{number(run.flight_time_s, 2)} s", f"{number(run.distance_m, 1)} m"
-            cells += [f"{rate(run)} %", *figures]
-        rows.append((title, *cells))
-    heads = ("success, gym", "time", "distance", "success, lockstep", "time", "distance")
-    return table(("policy, t2", *heads), rows, 6)
 
 
 @block("degradation", "degradation")

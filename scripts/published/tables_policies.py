@@ -104,16 +104,6 @@ def generalisation(records: Records) -> str:
     return table(("policy", *arenas), rows, len(arenas))
 
 
-@block("park", "park")
-def park(records: Records) -> str:
-    rows = []
-    for run in records["park"].runs.values():
-        classical = " (classical)" if find_policy(run.policy).card is None else ""
-        cells = (f"`{run.policy}`{classical}", f"{rate(run)} %")
-        rows.append((*cells, f"{number(run.flight_time_s, 2)} s"))
-    return table(("policy", "success", "flight time"), rows)
-
-
 # --- without one input
 
 _ZEROED = ("none", "velocity", "goal", "depth")

@@ -78,16 +78,15 @@ def source_line(record: Record) -> str:
 
 
 def made_table(records: Iterable[Record]) -> str:
-    """Return a table with the command, date, commit and processor of results."""
+    """Return a table with the command, date and commit of results."""
     return table(
-        ("result", "command", "date", "source", "processor"),
+        ("result", "command", "date", "source"),
         (
             (
                 f"`{each.name}`",
                 f"`{each.made.command}`",
                 each.made.date,
                 _commit(each),
-                each.made.cpu,
             )
             for each in records
         ),
