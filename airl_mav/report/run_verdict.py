@@ -273,8 +273,9 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     setup, episodes = run.info.setup, run.episodes
     verdict = judge_run(setup, aggregate(episodes), episodes, requirements)
     reasons = [reason for episode in episodes for reason in episode.invalid]
-    advice = ""
+    # Unchecked flights are never invalid: note and advice exclude each other.
+    advice = "".join(unchecked([run.info]))
     if setup.level == "sitl" and any(not each.startswith((BY_HAND, STRANGER)) for each in reasons):
         file = shlex.quote(str(run.path / SCENARIO_FILE))
         advice = f"To fly without real time, run: airl-sitl {file} --level lockstep"
-    return replace(verdict, advice=advice, sentences=verdict.sentences + unchecked([run.info]))
+    return replace(verdict, advice=advice)

@@ -512,7 +512,7 @@ def test_the_autopilot_imports_nothing_that_knows_the_truth() -> None:
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom):
-                names = [node.module or ""]
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
             for name in names:
                 standard = name.split(".")[0] in sys.stdlib_module_names
                 assert standard or name.startswith(allowed), f"{source.name}: {name}"

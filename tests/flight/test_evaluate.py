@@ -83,12 +83,12 @@ def greedy(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
     assert not list(out.glob("*.png"))
     tables, command = text.rsplit("\n\nreport  ", 1)
     # The printed command draws the page and prints the same tables.
-    words = shlex.split(command)
+    words = shlex.split(command.splitlines()[0])
     assert words == ["airl", "report", str(out)]
     code, shown = airl(*words[1:], width=100)
     assert code == 0
     assert tables.endswith(shown.rsplit("\n\nreport  ", 1)[0])
-    assert shown.endswith(f"report  {out / 'report.html'}\n")
+    assert f"\nreport  {out / 'report.html'}\n" in shown
     return load(out), text
 
 
@@ -806,13 +806,12 @@ def test_a_table_and_a_run_do_not_share_a_folder(
     with pytest.raises(UsageError, match="holds a single run"):
         evaluate("greedy", arena=("no-obstacles", "crowded"), out=run_.path)
     assert not (run_.path / "campaign.json").exists()
-    for file, what in (("campaign.json", "a campaign"), ("matrix.json", "an earlier version")):
-        folder = tmp_path / file.partition(".")[0]
-        folder.mkdir()
-        (folder / file).write_text("{}")
-        with pytest.raises(UsageError, match=f"holds .*{what}; accepted: another folder"):
-            evaluate("greedy", out=folder)
-        assert [path.name for path in folder.iterdir()] == [file]
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    (folder / "campaign.json").write_text("{}")
+    with pytest.raises(UsageError, match="holds a campaign; accepted: another folder"):
+        evaluate("greedy", out=folder)
+    assert [path.name for path in folder.iterdir()] == ["campaign.json"]
 
 
 # --- level sitl

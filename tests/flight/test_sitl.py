@@ -250,10 +250,13 @@ def test_tlog_opens(done: Done, index: int) -> None:
 
 
 def tables(output: str) -> list[str]:
-    """Return what stands from the first table on."""
+    """Return the lines from the first table to the report."""
     lines = [line.rstrip() for line in output.splitlines()]
     start = next(i for i, line in enumerate(lines) if line.startswith("vehicle "))
-    return lines[start:]
+    ends = ("drawing the report", "report  ")
+    end = next(i for i, line in enumerate(lines) if i > start and line.startswith(ends))
+    # Blank lines surround what is printed before the report.
+    return [line for line in lines[start:end] if line]
 
 
 def test_the_output_ends_with_one_sentence(done: Done) -> None:

@@ -388,7 +388,7 @@ def test_the_page_opens_offline_and_its_pictures_lie_beside_it(whole: tuple[Path
     said = ("Hardware gap", "Seeds that lost most", "86.6", "(85 - 73) / 73", "on the ground")
     for words in said:
         assert words in page.text
-    for name in ("gap", "flights", "worst"):
+    for name in ("hardware-gap", "flights", "worst"):
         with Image.open(out / f"{name}-static-obstacles.png") as picture:
             picture.load()
             assert min(picture.size) > 400

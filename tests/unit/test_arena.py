@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from scipy import ndimage, stats
 
-from airl_mav.arena import generate as generate_module
 from airl_mav.arena.draw import draw_arena, save_png
 from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
@@ -391,7 +390,7 @@ def test_too_dense_is_refused_with_counts_after_bounded_work(
         layouts.append(1)
         return place_all(*args)
 
-    monkeypatch.setattr(generate_module, "place_all", counted)
+    monkeypatch.setattr("airl_mav.arena.placement.place_all", counted)
     with pytest.raises(UsageError) as caught:
         make(spec_of(static={"count": [150, 150]}), 3)
     message = str(caught.value)

@@ -61,7 +61,7 @@ def found_with(folder: Path, camera: str, **asked: Any) -> list[CheckResult]:
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.program.LOOK_S", 0.1)
-    monkeypatch.setattr("companion.program.FRAME_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("companion.pilot.FRAME_TIMEOUT_S", 0.2)
 
 
 def test_a_good_camera_and_no_flight_controller(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def decided(
     problem: str = LATE,
 ) -> tuple[str, str, str]:
     """Return the level to fly, the warning, and the printed text; answer None: no terminal."""
-    monkeypatch.setattr(sitl_command, "host_problem", lambda _speed: problem)
+    monkeypatch.setattr(host_pace, "host_problem", lambda _speed: problem)
     monkeypatch.setattr(sys, "stdin", io.StringIO() if answer is None else Terminal(answer))
     monkeypatch.setattr(sys, "argv", ["airl-sitl", "--vehicle", "quad"])
     options = read_options(sitl_command.OPTIONS, "airl-sitl", ["--policy", "greedy", *words])

@@ -434,7 +434,7 @@ BEFORE = {
     "crowded": "82432176489be527",
     "dense-obstacles": "8a438123b43a4867",
     "dynamic-obstacles": "69ef4891829faffd",
-    "gates": "9b9f2f11fe015fb3",
+    "gates": "fc90bc9b602825ea",
     "no-obstacles": "b3bd1c1e80ca09d1",
     "open-field": "816a1fd462d4410a",
     "park": "0455810b97515a5a",
