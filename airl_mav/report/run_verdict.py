@@ -273,7 +273,6 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     setup, episodes = run.info.setup, run.episodes
     verdict = judge_run(setup, aggregate(episodes), episodes, requirements)
     reasons = [reason for episode in episodes for reason in episode.invalid]
-    # Unchecked flights are never invalid: note and advice exclude each other.
     advice = "".join(unchecked([run.info]))
     if setup.level == "sitl" and any(not each.startswith((BY_HAND, STRANGER)) for each in reasons):
         file = shlex.quote(str(run.path / SCENARIO_FILE))
