@@ -39,6 +39,7 @@ from airl_mav.cli.main import subcommands  # noqa: E402
 from airl_mav.core.fields import range_of, unit_of  # noqa: E402
 
 HOME, API, COMMANDS = "index.md", "reference/api.md", "reference/commands.md"
+ADDONS = "reference/addons.md"
 
 OBJECT = re.compile(r"^::: ([\w.]+)\n(?: .*\n|\n(?= ))*(?:\n<!-- fields: .* -->\n)?", re.MULTILINE)
 """Block of an object in the page of the Python API."""
@@ -71,6 +72,8 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Replace the comments of a page, and link parts to their pages; called for every page."""
     if page.file.src_uri == API:
         markdown = OBJECT.sub(_object_link, markdown)
+    elif page.file.src_uri == ADDONS:
+        markdown = with_options(markdown, "heading_level: 3", "members: false")
     elif page.file.src_uri == COMMANDS:
         rows = (f"| [{name}](commands/{file_of(name)}.md) | {what} |" for name, what in commands())
         markdown += "\n| command | purpose |\n|---|---|\n" + "\n".join(rows) + "\n"
@@ -126,8 +129,16 @@ def object_pages(listed: str) -> dict[str, str]:
     for match in OBJECT.finditer(listed):
         name = last_name(match[1])
         text = match[0].replace("heading_level: 3", "heading_level: 2")
+        if "options:" not in text:
+            text = with_options(text, "heading_level: 2", "show_if_no_docstring: true")
         pages[PARTS[API].format(name)] = f"# {name}\n\n{text}"
     return pages
+
+
+def with_options(markdown: str, *options: str) -> str:
+    """Return a page whose objects (`::: NAME`) have options of mkdocstrings."""
+    lines = "\n".join(("    options:", *(f"      {option}" for option in options)))
+    return re.sub(r"^(::: [\w.]+)$", rf"\1\n{lines}", markdown, flags=re.MULTILINE)
 
 
 def api_text() -> str:

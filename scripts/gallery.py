@@ -24,7 +24,6 @@ from airl_mav.cli import main as commands
 from airl_mav.core.files import replace_file
 from airl_mav.policy.registry import find_policy, policy_names
 from airl_mav.profiles import loading
-from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import arena_of, load
 from airl_mav.report import run_figures
@@ -57,14 +56,12 @@ def arenas() -> list[Entry]:
     for name in loading.list_profiles("arenas"):
         plan = f"airl arena {name} --seed {SEED} --png map.png"
         view = f"airl render {name} --seed {SEED} --width-px 480 --height-px 320 --out view.png"
-        spec = loading.load_profile("arenas", name, ArenaSpec)
-        size = f"{spec.size.north_m:g} x {spec.size.east_m:g} m"
         pictures = {
             f"arena-{name}.png": partial(draw_by_command, plan),
             f"view-{name}.png": partial(draw_by_command, view),
         }
         description = loading.describe_profile("arenas", name)
-        entries.append(Entry(name, description, f"Size: {size}.", (plan, view), pictures))
+        entries.append(Entry(name, description, "", (plan, view), pictures))
     return entries
 
 
@@ -83,7 +80,7 @@ def vehicles() -> list[Entry]:
         else:
             view = f"{taken} --camera {name} --out view.png"
         facts = (
-            f"Mass {body.mass_kg:g} kg. Main camera: {camera.kind}, {camera.width_px} x "
+            f" Mass {body.mass_kg:g} kg. Main camera: {camera.kind}, {camera.width_px} x "
             f"{camera.height_px} pixels, {camera.horizontal_fov_deg:g}°, {camera.rate_hz:g} Hz."
         )
         pictures = {f"vehicle-{name}.png": partial(draw_by_command, view)}
@@ -102,12 +99,14 @@ def policies() -> list[Entry]:
             continue
         environment = card.training.config["environment"]
         arena, vehicle = card.training.arena, environment["vehicle"]
-        options = f"--arena {arena} --seed {SEED}"
+        options = f"--arena {arena}"
         options += f" --vehicle {vehicle}" if vehicle != "quad" else ""
         scenario = Scenario(
             policy=name, arena=arena, vehicle=vehicle, level="gym", episodes=1, seed=SEED
         )
-        facts = f"Parameters: {card.parameters:,}. Decision period: {card.hold_s:g} s."
+        # Pipelined policies decide with every frame.
+        period = f"Decision period: {card.hold_s:g} s." if card.decisions == "sequential" else ""
+        facts = f" {period}".rstrip()
         for result in card.results[:1]:
             facts += (
                 f" Success in `{result.arena}`: {100.0 * result.success_rate:.1f} % of "
@@ -152,14 +151,11 @@ def page(title: str, introduction: str, entries: Iterable[Entry]) -> str:
     """Return a gallery page as Markdown."""
     parts = [f"# {title}\n\n<!-- Written by scripts/gallery.py -->\n\n{introduction}"]
     for entry in entries:
-        images = "\n".join(
-            f"![{entry.name}](../images/gallery/{file}){{ width=360 }}" for file in entry.pictures
-        )
+        images = "\n".join(f"![{entry.name}](../images/gallery/{file})" for file in entry.pictures)
         description = entry.description[0].upper() + entry.description[1:]
         # The first command shows the part; the others draw its pictures.
-        lines = entry.commands[0]
         parts.append(
-            f"## {entry.name}\n\n{description}. {entry.facts}\n\n{images}\n\n```sh\n{lines}\n```"
+            f"## {entry.name}\n\n{description}.{entry.facts}\n\n{images}\n\n`{entry.commands[0]}`"
         )
     return "\n\n".join(parts) + "\n"
 
