@@ -145,7 +145,7 @@ _WORDS = re.compile(
     "|(?:hexa|octo|tri)(?:copter|rotor)?|boat|fixed[-_]?wing|helicopter|plane|rover|tailsitter|vtol",
     re.IGNORECASE,
 )
-"""Words of a command line that ask for an unsupported vehicle, firmware or simulator."""
+"""Words on a command line for an unsupported vehicle, firmware or simulator."""
 
 
 def refer(words: Iterable[str]) -> str | None:
