@@ -227,10 +227,6 @@ def _signal_group(group: int, number: int) -> None:
         os.killpg(group, number)
 
 
-if __name__ == "__main__":
-    main()
-
-
 @contextmanager
 def stop_on_signals() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True after Ctrl-C or SIGTERM; a second one interrupts at once.
@@ -272,3 +268,7 @@ def signal_handlers(handler: Callable[[int, object], None], *numbers: int) -> It
     finally:
         for number, earlier in before.items():
             signal.signal(number, earlier)
+
+
+if __name__ == "__main__":
+    main()

@@ -237,10 +237,6 @@ def main() -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 AHEAD = Intrinsics(width=1, height=1, focal=1.0, cx=0.0, cy=0.0)
 """Camera with a single ray."""
 
@@ -370,3 +366,7 @@ def _in_sight(shown: Shown, asked: Floats) -> Floats:
         return asked
     at = np.array(vehicle.position)
     return unhidden(arena, vehicle.time_us - episode.started_us, at, asked)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
