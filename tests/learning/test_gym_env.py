@@ -6,6 +6,7 @@ import sys
 import types
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -100,6 +101,21 @@ def test_both_checkers_are_content_without_a_display(monkeypatch: pytest.MonkeyP
     check_env_for_sb3(env, skip_render_check=False)
     assert env.metadata["render_modes"] == ["rgb_array"], "there is nothing to open a window on"
     assert NavigationEnv.metadata["render_modes"] == ["rgb_array", "human"]
+
+
+def test_gymnasium_records_a_video_of_an_episode(tmp_path: Path) -> None:
+    av = pytest.importorskip("av", reason="needs the extra film")
+    pytest.importorskip("moviepy", reason="needs the extra film")
+    plain = gym.make(NAVIGATION, render_mode="rgb_array", arena="no-obstacles")
+    with gym.wrappers.RecordVideo(plain, str(tmp_path / "films")) as env:
+        env.reset(seed=1)
+        for _ in range(3):
+            env.step(FORWARD)
+    (path,) = tmp_path.glob("films/*.mp4")
+    with av.open(str(path)) as film:
+        frames = list(film.decode(video=0))
+        assert film.streams.video[0].average_rate == NavigationEnv.metadata["render_fps"]
+    assert [(frame.width, frame.height) for frame in frames] == [(960, 540)] * 4
 
 
 def test_sb3_trains_on_the_environment_s_name_alone() -> None:
