@@ -10,8 +10,8 @@ COPY constraints.txt /tmp/constraints.txt
 # The wheel's name contains the version; a requirement with an extra needs its exact path.
 RUN pip install --no-cache-dir --constraint /tmp/constraints.txt "$(ls /wheels/*.whl)[sim]" \
     && rm -r /wheels /tmp/constraints.txt \
-    && useradd --create-home airl
-USER airl
+    && useradd --create-home --uid 1000 airl
+USER 1000
 WORKDIR /home/airl
 # Kernels compile while the image is built, so that a container flies within seconds.
 RUN airl-firmware --duration 1
