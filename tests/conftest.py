@@ -113,8 +113,7 @@ def _one_worker_unless_asked() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("airl_mav.experiments.executors.usable_cores", lambda: 1)
-        for module in (experiment, experiment):
-            patch.setattr(module, "open_executor", here)
+        patch.setattr(experiment, "open_executor", here)
         yield
 
 

@@ -499,14 +499,14 @@ import sys
 from airl_mav.cli.options import run_command
 from airl_mav.rehearsal import firmware_process
 
-fly = firmware_process.fly_vehicle
+fly = firmware_process.fly
 
 def told(firmware, *rest):
     fly(firmware, *rest)
     print("epoch_ns", firmware.epoch_ns, flush=True)
     print("slipped_us", firmware.slipped_us, flush=True)
 
-firmware_process.fly_vehicle = told
+firmware_process.fly = told
 run_command("airl-firmware", "airl_mav.cli.firmware_command")
 """
 

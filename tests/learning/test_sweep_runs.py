@@ -14,10 +14,10 @@ from unittest.mock import patch
 
 import pytest
 
-from airl_mav.addons.sweep import command as sweep_command
 from airl_mav.addons.sweep.config import load_sweep, size_of, trials
 from airl_mav.addons.sweep.summary import SweepFolder
 from airl_mav.core.errors import EXIT_INTERRUPTED
+from airl_mav.experiments import executors
 from airl_mav.experiments.executors import open_executor
 from airl_mav.policy.card import read_card
 from airl_mav.policy.card_writing import NetworkSize
@@ -53,7 +53,7 @@ def sweep(folder: Path, *options: str) -> list[str]:
 
 def swept(folder: Path, *options: str) -> str:
     """Carry out a sweep in this process, its trainings too; return what it printed."""
-    with patch.object(sweep_command, "open_executor", partial(open_executor, in_process=True)):
+    with patch.object(executors, "open_executor", partial(open_executor, in_process=True)):
         code, text = airl("sweep", *sweep(folder, *options)[len(COMMAND) :])
     assert code == 0, text
     return text
