@@ -303,7 +303,7 @@ def test_injected_latency(tmp_path: Path) -> None:
     assert injection["origin"] == "injected"
     assert "template-5x32" in injection["label"]
     assert injection["latency"]["mean_ms"] == 396.0
-    assert "as if Raspberry Pi 4" in run.output
+    assert "396 ± 19.8 ms of injected latency" in run.output
     assert "as if Raspberry Pi 4" in (run.folder / "report.html").read_text(encoding="utf-8")
 
 
