@@ -1,4 +1,4 @@
-"""Snapshots: a restored simulation flies on bit-identically."""
+"""The example of snapshots: a restored simulation flies on bit-identically."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import WindSettings, load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft
+from examples.snapshot import Snapshot
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
@@ -84,7 +85,7 @@ def test_a_restored_simulation_flies_on_bit_identically(held: ExitStack, plant: 
     )
     wind = WindSettings(north_m_s=2.0, gust_m_s=1.0)
     simulation = hovering(held, plant=plant, wind=wind, faults=faults)
-    snapshot = simulation.snapshot()
+    snapshot = Snapshot(simulation)
     went_on = flown(simulation)
     one = held.enter_context(closing(snapshot.restore()))
     assert flown(one) == went_on
@@ -100,7 +101,7 @@ def test_contacts_are_restored(held: ExitStack, plant: str) -> None:
     built_in(simulation).set_mode(Mode.LAND)
     while not simulation.plant.body.touch.pressed:
         simulation.tick()
-    snapshot = simulation.snapshot()
+    snapshot = Snapshot(simulation)
     went_on = flown(simulation, land=True)
     assert simulation.autopilot.flight.phase < FlightPhase.AIR
     assert flown(held.enter_context(closing(snapshot.restore())), land=True) == went_on
@@ -109,7 +110,7 @@ def test_contacts_are_restored(held: ExitStack, plant: str) -> None:
 @pytest.mark.parametrize("vehicle", ["quad-flow", "quad-lidar", "quad-vio"])
 def test_optional_sensors_are_restored(held: ExitStack, vehicle: str) -> None:
     simulation = hovering(held, vehicle, plant="kernel")
-    snapshot = simulation.snapshot()
+    snapshot = Snapshot(simulation)
     went_on = flown(simulation)
     assert flown(held.enter_context(closing(snapshot.restore()))) == went_on
 
@@ -120,7 +121,7 @@ def test_a_snapshot_changes_nothing_and_keeps_the_time(held: ExitStack) -> None:
     simulation = hovering(held, plant="kernel")
     texts: list[Any] = []
     simulation.autopilot.on_message = texts.append
-    snapshot = simulation.snapshot()
+    snapshot = Snapshot(simulation)
     begin_us = simulation.time_us
     assert flown(simulation) == expected
     restored = held.enter_context(closing(snapshot.restore()))
@@ -135,4 +136,4 @@ def test_a_linked_flight_has_no_snapshot() -> None:
         stage.firmware.load(EpisodeSetup(load_vehicle("quad"), None, 1), None, 0)
         assert stage.firmware.simulation is not None
         with pytest.raises(ValueError, match="without links and logs"):
-            stage.firmware.simulation.snapshot()
+            Snapshot(stage.firmware.simulation)

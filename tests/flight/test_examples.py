@@ -96,6 +96,10 @@ def test_gymnasium_px4(tmp_path: Path) -> None:
     np.testing.assert_allclose(built_in, vectorized, rtol=0.1)
 
 
+def test_snapshot(tmp_path: Path) -> None:
+    assert output_of("snapshot.py", tmp_path) == "bit-identical: True\n"
+
+
 def test_the_policy_of_own_acceleration_reaches_its_goal() -> None:
     policy = f"{EXAMPLES / 'own_acceleration.py'}:ToGoal"
     asked = resolve(Scenario(policy=policy, arena="no-obstacles", level="lockstep"))
