@@ -7,7 +7,7 @@ pydantic's errors to one line.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
@@ -137,7 +137,7 @@ def quantity(
         le=le,
         lt=lt,
         json_schema_extra={"unit": unit},
-        exclude_if=_equals(default) if later else None,
+        exclude_if=(lambda value: bool(value == default)) if later else None,
     )
 
 
@@ -157,22 +157,13 @@ def later_field(default: Any, description: str | None = None) -> Any:
     A value equal to the default is left out of the dump, so that digests and cards do not change.
     The default may be a type, which is then called.
     """
-    made = default() if isinstance(default, type) else default
-    given: dict[str, Any] = (
-        {"default_factory": default} if isinstance(default, type) else {"default": default}
-    )
-    if description is not None:
+    made, key = default, "default"
+    if isinstance(default, type):
+        made, key = default(), "default_factory"
+    given: dict[str, Any] = {key: default}
+    if description is not None:  # None would override the description of an annotation.
         given["description"] = description
-    return Field(**given, exclude_if=_equals(made))
-
-
-def _equals(default: Any) -> Callable[[Any], bool]:
-    """Return a function that compares a value with a default."""
-
-    def is_default(value: Any) -> bool:
-        return bool(value == default)
-
-    return is_default
+    return Field(**given, exclude_if=lambda value: bool(value == made))
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import TypeAdapter
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -426,37 +425,16 @@ SCHEMA = 1
 TABLE_FILE = "table.json"
 
 
-@dataclass(frozen=True)
-class SavedTable:
-    """Contents of `TABLE_FILE`."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...]
-    policies: tuple[str, ...]
-    made: Mapping[str, Any]
-    """Provenance of the table (`core.provenance.provenance`)."""
-
-
-_SAVED = TypeAdapter(SavedTable)
-
-
 def write_table(
     view: TableView, folder: Path, made: Mapping[str, Any], policies: Sequence[str] = ()
 ) -> Path:
     """Write a table to a folder atomically; return the file's path."""
     columns = tuple(f"{c.title}, {c.unit}" if c.unit else c.title for c in view.columns)
-    saved = SavedTable(view.title, columns, view.rows, view.notes, tuple(policies), made)
+    data = {"title": view.title, "columns": columns, "rows": view.rows, "notes": view.notes}
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / TABLE_FILE
-    files.write_json(path, {"schema": SCHEMA, **asdict(saved)})
+    files.write_json(path, {"schema": SCHEMA, **data, "policies": policies, "made": made})
     return path
-
-
-def read_table(folder: Path) -> SavedTable:
-    """Read the table of a folder. Raises UsageError if it is missing or damaged."""
-    return files.read_typed(folder / TABLE_FILE, _SAVED, SCHEMA, "table")
 
 
 def with_interval(estimate: statistics.Estimate, digits: int = 1, sign: str = "") -> str:

@@ -127,11 +127,6 @@ def rate_digits(rate: Estimate) -> int:
     return 1 if rate.n >= MANY_FLIGHTS else 0
 
 
-def rate_with_interval(rate: Estimate) -> str:
-    """Return a rate in percent with its interval in brackets."""
-    return with_interval(rate.scaled(100.0), rate_digits(rate))
-
-
 def count_successes(n: int) -> str:
     """Return "3 common successes"."""
     return f"{n:,} common success" if n == 1 else f"{n:,} common successes"

@@ -21,7 +21,7 @@ from airl_mav.experiments.experiment import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, load_comparison
-from airl_mav.report.document import read_table
+from airl_mav.report.document import SCHEMA, TABLE_FILE
 from published.declared import Declared
 from published.record import (
     MEASURES,
@@ -139,9 +139,9 @@ def _sweep(out: Path) -> _Table:
 
 def _table(out: Path) -> _Table:
     """Return the table written by a script."""
-    saved = read_table(out)
-    printed = Printed(columns=saved.columns, rows=saved.rows)
-    return _Table(printed, saved.made, frozenset(saved.policies))
+    saved = read_json(out / TABLE_FILE, SCHEMA, "table")
+    printed = Printed(columns=saved["columns"], rows=saved["rows"])
+    return _Table(printed, saved["made"], frozenset(saved["policies"]))
 
 
 def _of_table(declared: Declared, found: _Table, behaviour: str | None) -> Record:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common import StudyConfig, StudyOptions, find_or_train, study
+from common import StudyConfig, StudyOptions, find_or_train, rate_with_interval, study
 from pydantic import Field, create_model
 from rich.console import Console
 
@@ -25,7 +25,6 @@ from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.loading import load_published
 from airl_mav.report.document import NONE, Column, TableView, print_table
-from airl_mav.report.measures import rate_with_interval
 from airl_mav.scenario.model import Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)

@@ -23,11 +23,12 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.statistics import bootstrap_mean
+from airl_mav.flight.statistics import Estimate, bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.loading import list_profiles, read_toml
 from airl_mav.report.document import with_interval
+from airl_mav.report.measures import rate_digits
 from airl_mav.scenario.model import LevelName, Scenario
 
 
@@ -112,3 +113,8 @@ def aside(path: Trajectory, episode: EpisodeRecord) -> float:
     north, east = np.array(episode.goal) / np.linalg.norm(episode.goal)
     position = path.between(start_us, episode.ended_us).position
     return float(np.abs(position[:, :2] @ np.array([-east, north])).max(initial=0.0))
+
+
+def rate_with_interval(rate: Estimate) -> str:
+    """Return a rate in percent with its interval in brackets."""
+    return with_interval(rate.scaled(100.0), rate_digits(rate))

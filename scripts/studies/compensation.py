@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from common import StudyConfig, StudyOptions, study
+from common import StudyConfig, StudyOptions, rate_with_interval, study
 from numpy.typing import NDArray
 from pydantic import Field, create_model
 from rich.console import Console
@@ -44,7 +44,6 @@ from airl_mav.report.document import (
     with_interval,
     write_table,
 )
-from airl_mav.report.measures import rate_with_interval
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 

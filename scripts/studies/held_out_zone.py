@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import tomli_w
-from common import StudyConfig, StudyOptions, find_or_train, study
+from common import StudyConfig, StudyOptions, find_or_train, rate_with_interval, study
 from pydantic import Field, create_model
 from rich.console import Console
 
@@ -28,7 +28,6 @@ from airl_mav.flight.statistics import aggregate
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.document import Column, TableView, print_table, with_interval
-from airl_mav.report.measures import rate_with_interval
 from airl_mav.training.config import TrainingConfig
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
