@@ -119,10 +119,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file. Raises UsageError."""
-    with usage_errors(path), path.open("rb") as file:
-        data = file.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
-        raise UsageError(f"{path}: accepted: a profile of at most {MOST_BYTES:,} bytes")
+    data = read_limited(path, "a profile")
     try:
         found = tomllib.loads(data.decode())
         too_deep = deeper_than(found, DEEPEST)
@@ -133,6 +130,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     if too_deep:
         raise UsageError(f"{path}: nested too deep: accepted: {DEEPEST} levels")
     return found
+
+
+def read_limited(path: Path, what: str, most: int = MOST_BYTES) -> bytes:
+    """Return the content of a file of at most `most` bytes. Raises UsageError."""
+    with usage_errors(path), path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise UsageError(f"{path}: accepted: {what} of at most {most:,} bytes")
+    return data
 
 
 def _anchor_files(data: object, folder: Path) -> None:
@@ -230,15 +236,10 @@ class CheckedFile(ProfileModel):
 def read_checked(named: CheckedFile) -> bytes:
     """Return the bytes of a file. Raises UsageError if missing or the digest differs."""
     path = Path(named.file)
-    try:
+    with usage_errors(path):
         if path.exists() and not path.is_file():
-            raise UsageError(f"{named.file}: no file")
-        with path.open("rb") as file:
-            data = file.read(MOST_FILE_BYTES + 1)
-    except OSError as error:
-        raise UsageError(f"{named.file}: {error.strerror}") from None
-    if len(data) > MOST_FILE_BYTES:
-        raise UsageError(f"{named.file}: accepted: a file of at most {MOST_FILE_BYTES:,} bytes")
+            raise UsageError(f"{path}: no file")
+    data = read_limited(path, "a file", MOST_FILE_BYTES)
     found = hashlib.sha256(data).hexdigest()
     if found != named.sha256:
         raise UsageError(

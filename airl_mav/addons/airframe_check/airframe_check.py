@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -11,10 +12,11 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.core import fields, progress
-from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.core import errors, fields, progress
+from airl_mav.core.constants import G_PER_KG, GRAVITY_M_S2, TICK_S
 from airl_mav.envs import fleet, fleet_step, stopping
 from airl_mav.flight.energy import level_powers_w
+from airl_mav.profiles.loading import read_limited
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import CORNERS, Payload, VehicleProfile, equipped
 from airl_mav.report import document
@@ -43,6 +45,9 @@ HOVER_TOLERANCE = 0.1
 MIN_THRUST_TO_WEIGHT = 1.8
 """Ratio below which wind and manoeuvres saturate the motors; PX4's documentation advises 2."""
 
+BENCH_RANGES = {"throttle_percent": (0.0, 100.0), "thrust_g": (0.0, 1e5), "voltage_v": (1.0, 1e3)}
+"""Ranges of a bench table's columns; all others 0 to 1000."""
+
 
 @dataclass(frozen=True)
 class StepFigures:
@@ -68,6 +73,22 @@ class MotorPoint:
 
 
 @dataclass(frozen=True)
+class BenchFit:
+    """Constants of a vehicle profile fitted to a bench table of one motor."""
+
+    thrust_max_n: float
+    thrust_curve: float
+    drive_efficiency: float
+    figure_of_merit: float
+    """Value of the profile: a bench table identifies only its product with `drive_efficiency`."""
+    throttle: NDArray[Any]
+    """Commands (n,), 0..1."""
+    measured: NDArray[Any]
+    """Thrust [N] and current [A], (n, 2); the same for `model`."""
+    model: NDArray[Any]
+
+
+@dataclass(frozen=True)
 class AirframeFigures:
     """Figures of a vehicle with its onboard computer."""
 
@@ -90,10 +111,15 @@ class AirframeFigures:
     steps: dict[str, StepFigures]
     motors: tuple[MotorPoint, ...]
     warnings: tuple[str, ...]
+    bench: BenchFit | None = None
+    """Fit to the bench table; None without a table."""
 
 
 def check_airframe(
-    vehicle: str, computer: str = "workstation", payload: Payload | None = None
+    vehicle: str,
+    computer: str = "workstation",
+    payload: Payload | None = None,
+    motor_data: Path | None = None,
 ) -> AirframeFigures:
     """Return the figures of a vehicle.
 
@@ -101,11 +127,17 @@ def check_airframe(
         vehicle: Name or path of a vehicle profile.
         computer: Name or path of the profile of its onboard computer.
         payload: Carried mass; None = no payload.
+        motor_data: Bench table of one motor, a CSV file with the columns throttle_percent,
+            thrust_n or thrust_g, current_a and optionally voltage_v (default: full pack).
+            Thrust and drive efficiency are fitted to it; None = values of the profile.
 
     Raises:
-        UsageError: A profile is unusable.
+        UsageError: A profile or the bench table is unusable.
     """
     profile, board = equipped(vehicle, computer, payload or Payload())
+    bench = None
+    if motor_data is not None:
+        profile, bench = _fit_motor(profile, motor_data)
     airframe = Airframe.from_profile(profile)
     constants = stopping.gym_constants_of(profile)
     weight_n = airframe.mass * GRAVITY_M_S2
@@ -133,8 +165,83 @@ def check_airframe(
         steps=_step_figures(constants),
         motors=tuple(_motor_points(profile)),
         warnings=(),
+        bench=bench,
     )
     return replace(figures, warnings=tuple(_warnings(profile, figures)))
+
+
+def _fit_motor(profile: VehicleProfile, path: Path) -> tuple[VehicleProfile, BenchFit]:
+    """Return a vehicle with constants fitted to a bench table, and the fit. Raises UsageError.
+
+    Least squares of thrust and of relative power: absolute power would fit full throttle only.
+    """
+    power, battery, n = profile.power, profile.battery, len(CORNERS)
+    if power.model != "momentum":
+        raise errors.UsageError(f"{path}: power.model = {power.model}: accepted: momentum")
+    airframe = Airframe.from_profile(profile)
+    unit = PowerModel.from_profile(profile)._replace(avionics_w=0.0, drive=1.0)
+
+    def shaft_w(thrusts: NDArray[Any]) -> NDArray[Any]:
+        return np.array([standing_power_w(n * each, airframe, unit) / n for each in thrusts])
+
+    table = _read_bench(path)
+    u, current = table["throttle_percent"] / 100.0, table["current_a"]
+    grams = table.get("thrust_g", np.empty(0))
+    thrust = table.get("thrust_n", grams * GRAVITY_M_S2 / G_PER_KG)
+    volts = table.get("voltage_v", np.full_like(u, battery.cells * battery.cell_full_v))
+    on = (u > 0.0) & (thrust > 0.0) & (current > 0.0)
+    if (found := len(np.unique(u[on]))) < 3:
+        problem = f"{found} throttles with thrust and current: accepted: at least 3"
+        raise errors.UsageError(f"{path}: {problem}")
+    square, linear = np.linalg.lstsq(np.column_stack((u * u, u)), thrust)[0]
+    # `command_for` loses digits for a curve that is almost 0.
+    curve = np.clip(square / (square + linear), 0.0, 1.0).round(4)
+    shape = curve * u * u + (1.0 - curve) * u
+    most = shape @ thrust / (shape @ shape)
+    ratio = shaft_w(thrust[on]) / (volts * current)[on]
+    drive = ratio @ ratio / ratio.sum()
+    if not 0.1 <= drive <= 1.0:
+        raise errors.UsageError(
+            f"{path}: drive_efficiency = {drive:.3g} at figure_of_merit = {power.figure_of_merit:g}"
+            ": accepted: 0.1 to 1; check units, figure_of_merit and propeller_diameter_m"
+        )
+    data = profile.model_dump()
+    data["rotor"] |= {"thrust_max_n": most, "thrust_curve": curve}
+    data["power"] |= {"drive_efficiency": drive}
+    fitted = fields.validated(VehicleProfile, data, path)
+    measured = np.column_stack((thrust, current))
+    model = np.column_stack((most * shape, shaft_w(most * shape) / drive / volts))
+    return fitted, BenchFit(most, curve, drive, power.figure_of_merit, u, measured, model)
+
+
+def _read_bench(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the columns of a bench table by name. Raises UsageError."""
+    try:
+        text = read_limited(path, "a table").decode("utf-8-sig").rstrip()
+    except UnicodeDecodeError as error:
+        raise errors.UsageError(f"{path}: not UTF-8 text: {error}") from None
+    lines = [[cell.strip(' "\t') for cell in line.split(",")] for line in text.splitlines()]
+    names, values = lines[0] if lines else [], []
+    required = [{"throttle_percent", thrust, "current_a"} for thrust in ("thrust_n", "thrust_g")]
+    if len(set(names)) < len(names) or set(names) - {"voltage_v"} not in required:
+        raise errors.UsageError(
+            f"{path}, line 1: {errors.shown(','.join(names))}: accepted: throttle_percent, "
+            "thrust_n or thrust_g, current_a, and optionally voltage_v"
+        )
+    for number, cells in enumerate(lines[1:], 2):
+        place = f"{path}, line {number}"
+        if len(cells) != len(names):
+            raise errors.UsageError(f"{place}: {len(cells)} values: accepted: {len(names)}")
+        for name, cell in zip(names, cells, strict=True):
+            low, high = BENCH_RANGES.get(name, (0.0, 1e3))
+            try:
+                values.append(float(cell))
+            except ValueError:
+                values.append(np.nan)
+            if not low <= values[-1] <= high:
+                found = f"{name} = {errors.shown(cell)}"
+                raise errors.UsageError(f"{place}: {found}: accepted: {low:g} to {high:,.0f}")
+    return dict(zip(names, np.reshape(values, (-1, len(names))).T, strict=True))
 
 
 def _top_speed(constants: fleet.FleetConstants) -> float:
@@ -218,7 +325,7 @@ class VehicleOptions(fields.ProfileModel):
 
     Examples:
         airl vehicle quad
-        airl vehicle my-quad.toml --computer ras-pi-4
+        airl vehicle my-quad.toml --motor-data motor.csv
     """
 
     vehicle: Annotated[str, POSITIONAL] = Field(
@@ -228,6 +335,9 @@ class VehicleOptions(fields.ProfileModel):
         default="workstation", description="computer profile on board, a shipped name or a path"
     )
     payload: Payload = Field(default_factory=Payload, description="carried mass")
+    motor_data: Path | None = fields.optional(
+        "bench table of one motor, a .csv; its fit replaces thrust and drive efficiency"
+    )
 
 
 OPTIONS = VehicleOptions
@@ -236,9 +346,10 @@ OPTIONS = VehicleOptions
 def run(options: VehicleOptions, console: Console | None = None) -> int:
     """Print the figures; return 0. Raises UsageError as `check_airframe` does."""
     console = console or progress.new_console()
-    found = check_airframe(options.vehicle, options.computer, options.payload)
+    found = check_airframe(options.vehicle, options.computer, options.payload, options.motor_data)
     document.print_facts(_facts(found), console)
-    for table in (_step_table(found), _motor_table(found)):
+    bench = [] if found.bench is None else [_bench_table(found.bench)]
+    for table in (_step_table(found), _motor_table(found), *bench):
         console.print()
         document.print_table(table, console)
     console.print()
@@ -280,14 +391,31 @@ def _step_table(found: AirframeFigures) -> document.TableView:
 
 def _motor_table(found: AirframeFigures) -> document.TableView:
     rows = tuple(
-        (
-            f"{100 * point.throttle:.0f}",
-            f"{point.thrust_n:.2f}",
-            f"{point.current_a:.1f}",
-            f"{point.power_w:.0f}",
-        )
-        for point in found.motors
+        (f"{100 * m.throttle:.0f}", f"{m.thrust_n:.2f}", f"{m.current_a:.1f}", f"{m.power_w:.0f}")
+        for m in found.motors
     )
     columns = document.columns_of("throttle [%] | thrust of a motor [N] | current [A] | power [W]")
     notes = ("Current and power of all motors on a full pack, in a static test.",)
     return document.TableView("motors", "Motors", columns, rows, notes)
+
+
+def _bench_table(fit: BenchFit) -> document.TableView:
+    off = fit.model - fit.measured
+    thrust_rms, current_rms = np.sqrt(np.mean(off**2, axis=0))
+    figures = np.dstack((fit.measured, fit.model, off)).reshape(-1, 6)
+    rows = tuple(
+        (f"{100 * u:g}", *(f"{figure:.2f}" for figure in row))
+        for u, row in zip(fit.throttle, figures, strict=True)
+    )
+    columns = document.columns_of(
+        "throttle [%] | thrust [N] | model | difference | current [A] | model | difference"
+    )
+    product = fit.figure_of_merit * fit.drive_efficiency
+    notes = (
+        f"Root-mean-square difference: {thrust_rms:.2f} N, {current_rms:.2f} A.",
+        f"A table identifies only figure_of_merit * drive_efficiency = {product:.3f}.",
+        "Lines for the profile:",
+        f"[rotor]\nthrust_max_n = {fit.thrust_max_n:.4g}\nthrust_curve = {fit.thrust_curve:.4g}",
+        f"[power]\ndrive_efficiency = {fit.drive_efficiency:.4g}",
+    )
+    return document.TableView("bench", "Bench table of one motor", columns, rows, notes)
