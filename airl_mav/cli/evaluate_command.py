@@ -9,18 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.cli import shared_options
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.cli.shared_options import (
-    ExperimentOptions,
-    Gate,
-    Viewing,
-    Voice,
-    episodes,
-    fly_and_show,
-    leave,
-    requirements_of,
-    view_of,
-)
+from airl_mav.cli.shared_options import ExperimentOptions, Gate, Viewing, Voice
 from airl_mav.core import errors, fields
 
 if TYPE_CHECKING:
@@ -51,7 +42,7 @@ class EvaluateOptions(Gate, Viewing, ExperimentOptions):
         description="arena profiles: shipped names, or paths to .toml files; by default those that"
         " the policies were trained in, or static-obstacles",
     )
-    episodes: int = episodes("number of episodes in each arena", 100)
+    episodes: int = shared_options.episodes("number of episodes in each arena", 100)
     each_fault: bool = Field(
         default=False,
         description="fly every policy healthy and with each fault alone, a row each, instead of"
@@ -75,41 +66,37 @@ OPTIONS = EvaluateOptions
 def run(options: EvaluateOptions, console: Console | None = None) -> int:
     """Evaluate; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     # Imported here and below: options do not need the simulator.
-    from airl_mav.experiments.evaluate import (
-        check_plain,
-        evaluation_cells,
-        matrix,
-        write_on_card,
-    )
+    from airl_mav.experiments.evaluate import check_plain, evaluation_cells, matrix, write_on_card
     from airl_mav.experiments.experiment import fly_scenario, known_seeds, run_name
     from airl_mav.experiments.live import fly_live
+    from airl_mav.rehearsal.host_pace import host_warning
 
     voice = Voice(options, "airl evaluate", console)
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     each_fault = options.each_fault
     cells = evaluation_cells(scenario, options.policies, options.arena, each_fault=each_fault)
-    view = view_of(options)
+    view = shared_options.view_of(options)
     if view is not None and (len(cells) > 1 or options.level == "gym"):
-        raise errors.FieldError(
-            "view",
-            True,
-            problem="accepted: with one policy in one arena, at level lockstep or sitl",
-        )
+        problem = "accepted: with one policy in one arena, at level lockstep or sitl"
+        raise errors.FieldError("view", True, problem=problem)
     if options.on_card:
         check_plain(cells)
     if len(cells) > 1:
         experiment = matrix(scenario, options.policies, options.arena, each_fault=each_fault)
-        code, compared = fly_and_show(experiment, options.out, console, options, options)
+        code, compared = shared_options.fly_and_show(
+            experiment, options.out, console, options, options
+        )
         for run in compared.cells if options.on_card else ():
             if run.complete:
                 write_on_card(run.cell, run.episodes)
         return code
     (cell,) = cells
-    requirements = requirements_of(options, reference=False)
+    requirements = shared_options.requirements_of(options, reference=False)
     with voice:
         progress = voice.progress
-        for warning in known_seeds(cells):
-            progress.note(warning, "yellow")
+        for warning in (*known_seeds(cells), host_warning(cell.scenario.scenario)):
+            if warning:
+                progress.note(warning, "yellow")
         if view is None:
             flown = fly_scenario(cell.scenario, options.out, progress)
         else:
@@ -138,7 +125,7 @@ def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voic
     verdict = verdict_of(loaded, requirements)
     more: list[str] = []
     if flown.ended == "complete":
-        leave(gate, verdict, "airl evaluate")
+        shared_options.leave(gate, verdict, "airl evaluate")
         code = verdict.exit_code
         if (sha256 := run_sha256(flown.episodes)) is not None:
             more = [f"sha256 of the flights  {sha256}"]

@@ -93,11 +93,8 @@ def on_this_host(
 
     A user at a terminal may choose level lockstep. Otherwise the flights begin after the warning.
     """
-    asked = scenario.scenario
-    checked = asked.level == "sitl" and asked.validity
-    if not (checked and (problem := host_pace.host_problem(scenario.speed or 1.0))):
+    if not (warning := host_pace.host_warning(scenario.scenario)):
         return scenario, ""
-    warning = f"warning: flights may be invalid, as this host does not keep real time: {problem}"
     try:
         lockstep = resolve(scenario_of(options, level="lockstep"))
     except UsageError:

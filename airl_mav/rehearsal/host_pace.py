@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import TYPE_CHECKING
 
 from airl_mav.core.constants import TICK_US, US_PER_MS
 from firmware_sim.pacing import MAX_LAG_US, WallPacing
+
+if TYPE_CHECKING:
+    from airl_mav.scenario.model import Scenario
 
 PROCESSES = 2
 
@@ -26,6 +30,14 @@ LOOPS = 20_000
 
 LATE_MS = 20.0
 """Maximum lateness of a tick [ms]."""
+
+
+def host_warning(asked: Scenario) -> str:
+    """Return a warning if flights of a scenario may be invalid on this host; empty if not."""
+    checked = asked.level == "sitl" and asked.validity
+    if not (checked and (problem := host_problem(asked.speed or 1.0))):
+        return ""
+    return f"warning: flights may be invalid, as this host does not keep real time: {problem}"
 
 
 def host_problem(speed: float) -> str:

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from airl_mav.flight.statistics import NO_ESTIMATE
 from airl_mav.latency.stages import CommandAges, Summary, command_ages, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
-from airl_mav.report import document, run_verdict, tracking
+from airl_mav.report import document, run_verdict
 from airl_mav.report.document import print_place, print_verdict
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
@@ -36,6 +36,9 @@ from airl_mav.report.measures import (
     rate_digits,
     summarize_run,
 )
+
+if TYPE_CHECKING:
+    from airl_mav.report import tracking
 
 BYTES_PER_MIB = 1 << 20
 

@@ -24,7 +24,7 @@ import pytest
 from PIL import Image
 
 from airl_mav.arena.generate import generate
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import EXIT_INVALID, UsageError
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
 from airl_mav.experiments import campaign, gym_flier
@@ -34,9 +34,9 @@ from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import Encoded
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
-from airl_mav.rehearsal import run_folder
+from airl_mav.rehearsal import host_pace, run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, arena_of, load
-from airl_mav.report import run_report
+from airl_mav.report import run_report, run_tables
 from airl_mav.report.comparison import show
 from airl_mav.report.run_report import write_report
 from airl_mav.scenario.model import Scenario
@@ -410,7 +410,7 @@ def test_a_long_table_is_cut_short_and_says_so(
 ) -> None:
     run_, text = greedy
     assert f"25 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in text
-    monkeypatch.setattr(run_report, "MAX_FLIGHTS", 5)
+    monkeypatch.setattr(run_tables, "MAX_FLIGHTS", 5)
     monkeypatch.setattr(run_report, "MAX_PICTURED", 1)
     shutil.copytree(run_.path, tmp_path / "copy")
     path = write_report(tmp_path / "copy")
@@ -570,10 +570,10 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     before = {p.name: p.read_bytes() for p in run_.path.iterdir()}
     code, again = evaluate("greedy", slots=3, out=run_.path, **DENSE)
     assert code == 0
-    tables, page = again.rsplit("\n\nreport  ", 1)
-    assert tables.endswith(text.rsplit("\n\nreport  ", 1)[0])
+    tables, end = again.replace("drawing the report\n", "").rsplit("report  ", 1)
+    assert tables.endswith(text.replace("drawing the report\n", "").rsplit("report  ", 1)[0])
     # There is a page: it is drawn again.
-    assert page == f"{run_.path / 'report.html'}\n"
+    assert end.startswith(f"{run_.path / 'report.html'}\n\ngreedy on workstation")
     after = {p.name: p.read_bytes() for p in run_.path.iterdir()}
     assert before == after
 
@@ -831,13 +831,15 @@ def test_every_level_flies_by_the_rules_of_the_card(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(300)
-def test_level_sitl_flies(linear: Path, tmp_path: Path) -> None:
+def test_level_sitl_flies(linear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(host_pace, "host_problem", lambda speed: f"busy at speed {speed:g}")
     ports = vars(choose_ports())
     options: dict[str, Any] = {f"{name}_port": port for name, port in ports.items()}
-    options |= {"arena": "no-obstacles", "level": "sitl", "speed": 4.0, "no_validity": True}
+    options |= {"arena": "no-obstacles", "level": "sitl", "speed": 4.0}
     out = tmp_path / "run"
     code, text = evaluate(linear, episodes=1, seed=10, out=out, **options)
-    assert code == 0
+    assert "warning: flights may be invalid, as this host does not keep real time: busy" in text
+    assert code in {0, EXIT_INVALID}
     assert "success rate" in text
     (episode,) = load(out).episodes
     assert (episode.seed, episode.outcome) == (10, Outcome.SUCCESS)
