@@ -699,7 +699,7 @@ def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Pat
         sys.executable,
         "-m",
         "airl_mav.cli.main",
-        "gap",
+        "hardware-gap",
         *("--mitigated", mitigated, "--episodes", f"{EPISODES}", "--out", str(out)),
     ]
     root = Path(__file__).parents[2]
