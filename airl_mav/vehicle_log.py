@@ -177,16 +177,18 @@ def read_vehicle_log(path: Path) -> VehicleLog:
     # An unmeasured current must not look like a small one.
     battery[battery[:, 1] == constants.UNMEASURED_A, 1] = np.nan
     known = {name: each if name in _PARTLY_NAN else _known(each) for name, each in series.items()}
+    # pyulog returns a parameter of a damaged type as bytes.
+    given = read.initial_parameters.items()
     return VehicleLog(
         path=path,
-        parameters={name: float(value) for name, value in read.initial_parameters.items()},
+        parameters={name: float(value) for name, value in given if type(value) is not bytes},
         **known | {name: _upward(known[name]) for name in ("attitude_setpoint", "rates_setpoint")},
     )
 
 
 def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Series:
     data = topics.get(topic)
-    if data is None or any(name not in data for name in fields):
+    if data is None or any(name not in data for name in ("timestamp", *fields)):
         return empty(len(fields))
     # Values belong to the sample's time; `timestamp` is the later time of publication.
     times = np.asarray(data.get("timestamp_sample", data["timestamp"]), np.int64)

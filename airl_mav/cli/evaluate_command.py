@@ -94,9 +94,8 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
     requirements = shared_options.requirements_of(options, reference=False)
     with voice:
         progress = voice.progress
-        for warning in (*known_seeds(cells), host_warning(cell.scenario.scenario)):
-            if warning:
-                progress.note(warning, "yellow")
+        for warning in filter(None, (*known_seeds(cells), host_warning(cell.scenario.scenario))):
+            progress.note(warning, "yellow")
         if view is None:
             flown = fly_scenario(cell.scenario, options.out, progress)
         else:

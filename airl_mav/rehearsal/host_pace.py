@@ -35,9 +35,8 @@ LATE_MS = 20.0
 def host_warning(asked: Scenario) -> str:
     """Return a warning if flights of a scenario may be invalid on this host; empty if not."""
     checked = asked.level == "sitl" and asked.validity
-    if not (checked and (problem := host_problem(asked.speed or 1.0))):
-        return ""
-    return f"warning: flights may be invalid, as this host does not keep real time: {problem}"
+    why = host_problem(asked.speed or 1.0) if checked else ""
+    return why and f"warning: flights may be invalid, as this host does not keep real time: {why}"
 
 
 def host_problem(speed: float) -> str:
