@@ -122,8 +122,8 @@ def fly(vehicle: VehicleProfile, seed: int, seconds: float, nis: Noted, nees: No
     ticks = 0
     try:
         for _ in pilot(simulation, autopilot, np.random.default_rng(seed), seconds):
-            truth = simulation.truth
             simulation.tick()
+            truth = simulation.truth  # of the same time as the estimate
             flying = autopilot.flight.phase is FlightPhase.AIR
             autopilot.estimator.innovations = nis.take if flying else None
             ticks += flying
