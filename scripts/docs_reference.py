@@ -250,8 +250,9 @@ def _type(annotation: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(_type(part) for part in arguments if part is not type(None))
     if origin in (tuple, list):
-        parts = [_type(part) for part in arguments if part is not Ellipsis]
-        return f"list of {parts[0]}" if Ellipsis in arguments or origin is list else f"{parts}"
+        parts = list(dict.fromkeys(_type(part) for part in arguments if part is not Ellipsis))
+        number = "" if Ellipsis in arguments or origin is list else f"{len(arguments)} × "
+        return f"list of {number}{' or '.join(parts)}"
     if origin is dict:
         return f"table of {_type(arguments[1])}"
     names = {str: "text", int: "integer", float: "number", bool: "`true`, `false`", Path: "path"}
@@ -264,7 +265,7 @@ def _default(field: FieldInfo) -> str:
     if field.default_factory is not None or field.default is None:
         return "–"
     value = field.default
-    if isinstance(value, BaseModel):
+    if isinstance(value, BaseModel) or value in ("", ()):
         return "–"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"

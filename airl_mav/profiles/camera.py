@@ -34,7 +34,7 @@ Coefficients = Annotated[
 
 
 class Stereo(ProfileModel):
-    """Stereo matching of a depth camera with two imagers; see `camera.noise`."""
+    """Stereo matching of a depth camera with two imagers; see `airl_mav.camera.noise`."""
 
     baseline_m: float = quantity("distance between the imagers", "m", ge=0.01, le=1)
     focal_px: float = quantity(
@@ -48,7 +48,7 @@ class Stereo(ProfileModel):
 
 
 class Ranging(ProfileModel):
-    """Errors of a lidar or another range sensor; see `camera.noise`."""
+    """Errors of a lidar or another range sensor; see `airl_mav.camera.noise`."""
 
     noise_m: float = quantity("noise of a range, sd", "m", ge=0, le=5, default=0.0)
     noise_share: float = quantity(

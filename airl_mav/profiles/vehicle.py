@@ -418,7 +418,7 @@ class Battery(ProfileModel):
 
 
 class Momentum(ProfileModel):
-    """Power by momentum theory, from rotor data; `vehicle.power` has the formula."""
+    """Power by momentum theory, from rotor data; formula in docs/explanation/energy.md."""
 
     model: Literal["momentum"] = Field(description="momentum theory")
     propeller_diameter_m: float = quantity("diameter of a propeller", "m", gt=0.01, le=5)

@@ -244,10 +244,9 @@ class Decisions(Inference):
         " default as the policy's card says, or not"
     )
     origin: Annotated[Place | None, NOT_IN_GYM] = optional(
-        "where on the globe the flight begins: latitude, longitude (degrees), altitude"
-        " above mean sea level (m). A flight controller without GPS is told it before it is armed,"
-        " as it flies Hold only where it knows its place; by default, in a rehearsal without GPS,"
-        " the place of all rehearsals"
+        "start position: latitude, longitude (degrees), altitude above mean sea level (m)."
+        " A flight controller without GPS receives it before arming, as Hold requires a position;"
+        " by default, in a rehearsal without GPS, the start of all rehearsals"
     )
     watchdog: WatchdogSettings = Field(
         default_factory=WatchdogSettings, description="bounds on silence"

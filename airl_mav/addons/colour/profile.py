@@ -315,7 +315,7 @@ class Appearance(ProfileModel):
 
 
 class AutoExposure(ProfileModel):
-    """A gain that follows the brightness of the image; see `colour.image_sensor`."""
+    """Gain that follows the image's brightness; see `airl_mav.addons.colour.image_sensor`."""
 
     target: float = quantity(
         "mean light of the image that it aims at; 1 is white", "1", ge=0.01, le=0.9, default=0.18
