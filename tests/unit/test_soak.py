@@ -108,7 +108,7 @@ def test_what_the_machine_does_not_tell_is_said() -> None:
     assert (soaked.throttled, soaked.frequency_dropped) == (None, None)
     assert soaked.ends("temperature_c") is None
     for what in ("frequency", "temperature", "throttling"):
-        assert f"{what}: not told by this system" in soaked.sentence()
+        assert f"{what}: not available" in soaked.sentence()
     assert np.isnan(soaked.series["power_w"]).all()
     facts = soaked.facts()
     assert (facts["temperature_c"], facts["throttled"]) == (None, None)

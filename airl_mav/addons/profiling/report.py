@@ -133,9 +133,8 @@ def _time_table(measured: ComputerMeasurement) -> TableView:
             f"Age of the command: since its image was {start}, at a random moment of the flight"
             f"{flown}. t2 corrected: with the decisions that were due every {hold_s:g} s "
             "meanwhile.",
-            "The loop is closed: a decision begins when the last one has ended, so a slow one "
-            "keeps others from being counted. This table corrects for that: see "
-            "docs/how-to/profile.md.",
+            "The loop is closed: each decision waits for the last one, so slow decisions are "
+            "undercounted. Corrected samples compensate for that.",
         ),
     )
 

@@ -121,7 +121,7 @@ class Soak:
         if self.throttled is not None:
             throttling = "throttled" if self.throttled else "not throttled"
         known = {"frequency": frequency, "temperature": temperature, "throttling": throttling}
-        return "; ".join(text or f"{name}: not told by this system" for name, text in known.items())
+        return "; ".join(text or f"{name}: not available" for name, text in known.items())
 
 
 def soak(
