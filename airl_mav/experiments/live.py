@@ -134,4 +134,4 @@ def tell_end(path: Path, ended: Ended, problem: str, progress: Progress) -> None
     if problem:
         progress.note(f"error: {problem}", "red")
     if ended != "complete":
-        progress.note(f"{ended}: what was flown is kept; --out {path} goes on", "yellow")
+        progress.note(f"{ended}: finished flights are kept; resume with --out {path}", "yellow")

@@ -123,7 +123,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
     try:
         study(options, load_profile("sweeps", f"{options.config}", StudyConfig), console)
     except KeyboardInterrupt:
-        console.print(f"interrupted: the same command with --out {options.out} goes on")
+        console.print(f"interrupted: resume with --out {options.out}")
         return EXIT_INTERRUPTED
     return 0
 

@@ -515,7 +515,7 @@ def test_an_interrupted_run_goes_on_and_ends_as_if_nothing_had_been(
     text, _ = process.communicate(timeout=60)
     assert process.returncode == (-9 if number is signal.SIGKILL else 130), text
     if number is not signal.SIGKILL:
-        assert "interrupted: what was flown is kept" in text
+        assert "interrupted: finished flights are kept" in text
         assert "success rate" in text
     flown = load(out).episodes
     assert 10 <= len(flown) < 40

@@ -311,7 +311,7 @@ def test_a_flight_that_kills_its_workers_ends_the_run_with_one_line(
     assert code == 1
     assert text.count("a worker was lost by SIGKILL: seed 41 begins again") == 2
     assert "error: seed 41: lost 3 workers, the last one by SIGKILL\n" in text
-    assert f"broken off: what was flown is kept; --out {tmp_path / 'run'} goes on" in text
+    assert f"broken off: finished flights are kept; resume with --out {tmp_path / 'run'}" in text
     assert [e.index for e in held.episodes] == [0]
     # The table has the digest of the finished flight; the last line, of whole runs, is missing.
     assert text.count("sha256 of the flights") == 1

@@ -245,7 +245,7 @@ def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
         assert run.wait(40.0) == 130
         run.no_child_left()
     text = run.text()
-    assert f"interrupted: what was flown is kept; --out {tmp_path / 'run'} goes on" in text
+    assert f"interrupted: finished flights are kept; resume with --out {tmp_path / 'run'}" in text
     assert "Traceback" not in text
     # Verdict on the finished flights.
     assert "goals reached" in text
@@ -264,7 +264,7 @@ def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
         run.process.terminate()
         assert run.wait(40.0) == 130
         run.no_child_left()
-    assert "interrupted: what was flown is kept" in run.text()
+    assert "interrupted: finished flights are kept" in run.text()
     assert "no episode was finished" in run.text()
     assert "Traceback" not in run.text()
     nothing_half_written(tmp_path / "run")

@@ -127,7 +127,7 @@ def test_an_interrupted_run_goes_on(fly: Fly, stage: Stage, tmp_path: Path) -> N
     stage.ends[2] = KeyboardInterrupt()
     code, text = fly()
     assert code == 130
-    assert f"interrupted: what was flown is kept; --out {out} goes on" in text
+    assert f"interrupted: finished flights are kept; resume with --out {out}" in text
     assert stage.flown == [0, 1]
     # Ports decide nothing; an interrupt that comes at once loses nothing.
     stage.ends[2] = KeyboardInterrupt()
@@ -156,7 +156,7 @@ def test_a_flight_that_is_lost_too_often_ends_the_run(
     code, text = fly()
     assert code == 1
     assert "error: flight 001, seed 6: lost 3 times; at last the companion died" in text
-    assert f"broken off: what was flown is kept; --out {tmp_path / 'run'} goes on" in text
+    assert f"broken off: finished flights are kept; resume with --out {tmp_path / 'run'}" in text
     assert fly()[0] == 0
     assert stage.flown == [0, 1, 2, 3]
 

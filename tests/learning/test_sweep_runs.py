@@ -163,7 +163,7 @@ def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
         process.wait_for_text("a worker was lost by SIGKILL")
         process.interrupt()
         assert process.wait() == EXIT_INTERRUPTED, process.text()
-        assert f"the same command with --out {tmp_path / 'out'} goes on" in process.text()
+        assert f"resume with --out {tmp_path / 'out'}" in process.text()
     before = checkpointed(tmp_path)
     words = sweep(tmp_path, "--workers", "1")
     with running(words, tmp_path) as process:

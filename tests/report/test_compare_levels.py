@@ -562,7 +562,7 @@ def test_an_interrupted_comparison_goes_on(whole: tuple[Path, str], tmp_path: Pa
     with interrupted_after(2 * EPISODES + 2):
         code, text = climb(out=out, slots=1)
     assert code == 130
-    assert f"interrupted: what was flown is kept; --out {out} goes on" in text
+    assert f"interrupted: finished flights are kept; resume with --out {out}" in text
     assert "2 of 6 at sitl" in text
     assert contrasts_of(data_of(out))[1]["success_rate"]["difference"]["n"] == 2
     # Cut again at once, then to the end.
@@ -579,7 +579,7 @@ def test_an_interrupted_first_level(_twins: None, tmp_path: Path) -> None:
     with interrupted_after(2):
         code, text = climb(out=out, slots=1, levels=("gym", "lockstep"))
     assert code == 130
-    assert "goes on" in text
+    assert "resume with" in text
     assert not (out / LEVELS_FILE).exists()
     assert len(load(out / "gym").episodes) == 2
 

@@ -466,7 +466,7 @@ def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigate
     with patch.object(EpisodeSaver, "add", interrupted):
         code, text = measure(mitigated, out=tmp_path / "root")
     assert code == 130
-    assert "goes on" in text
+    assert "resume with" in text
     data = data_of(tmp_path / "root")
     assert [gap["entry"]["key"] for gap in data["contrasts"]] == ["without-mitigation"]
     assert gap_of(data, "without-mitigation") == gap_of(data_of(whole[0]), "without-mitigation")
@@ -724,7 +724,8 @@ def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Pat
     finally:
         process.kill()
     assert process.returncode == 130
-    assert f"interrupted: what was flown is kept; --out {out} goes on" in " ".join(text.split())
+    assert "interrupted: finished flights are kept" in text
+    assert f"resume with --out {out}" in " ".join(text.split())
     done = subprocess.run(
         command, cwd=root, env=environment, capture_output=True, text=True, timeout=300, check=False
     )

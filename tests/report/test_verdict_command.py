@@ -67,7 +67,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     out = tmp_path_factory.mktemp("verdict") / "out"
     code, text = interrupted_after(27, out)
     assert code == 130
-    assert "goes on" in text
+    assert "resume with" in text
     assert not (out / "verdict.json").exists()
     assert len(outcomes(out / TARGET)) == 27
     with page_alone():

@@ -78,7 +78,7 @@ class SweepOptions(Workers):
     )
     computer: str | None = fields.optional(
         "computer profile: each cell then shows its decision latency t2 there,"
-        " estimated from multiply-accumulates; may change when a sweep goes on"
+        " estimated from multiply-accumulates; may change when a sweep resumes"
     )
     device: Literal["cpu", "cuda"] = Field(
         default="cpu", description="device for training: cpu, one core per trial, or cuda"
@@ -302,7 +302,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
     if sweep.ended == sweep.planned:
         return 0
     told = "interrupted" if error is None else "not all trials have ended"
-    progress.note(f"{told}: the same command with --out {path} goes on", "yellow")
+    progress.note(f"{told}: resume with --out {path}", "yellow")
     return errors.EXIT_INTERRUPTED if error is None else errors.EXIT_BROKEN
 
 
