@@ -12,8 +12,9 @@ from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json, write_json
 from airl_mav.flight.statistics import Estimate
 from airl_mav.policy.registry import POLICIES, find_policy, policy_names
+from airl_mav.training.config import check_seeds
 from published.behaviour import read_behaviour
-from published.changes import read_changes, stands
+from published.changes import read_changes, read_withdrawn, stands
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
@@ -59,6 +60,11 @@ class FlownRun(ProfileModel):
     flight_time_s: Figure = Field(description="this and the following: flights with success")
     distance_m: Figure
     energy_j: Figure = Field(description="of the vehicle, without its computer")
+
+    @model_validator(mode="after")
+    def _seeds_are_not_held_out(self) -> FlownRun:
+        check_seeds(self.seed, self.success_rate.n)
+        return self
 
 
 class Gap(ProfileModel):
@@ -160,6 +166,8 @@ def out_of_date(record: Record) -> str:
     """Return a sentence on why figures are outdated; empty: up to date."""
     made, runs = record.made, [(run.level, run.arena) for run in record.runs.values()]
     flown = f"Flown on {made.date} with version {made.version}"
+    if why := read_withdrawn(CHANGES_FILE).get((record.name, made.commit)):
+        return f"{flown}, {why}."
     changes = read_changes(CHANGES_FILE)
     if not stands(made.behaviour, behaviour_today(), changes, record.name, runs):
         return f"{flown}, before today's flight behaviour."
