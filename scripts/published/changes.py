@@ -46,30 +46,14 @@ class Change(ProfileModel):
         return any(level in self.levels and arena in self.arenas for level, arena in runs)
 
 
-class Withdrawn(ProfileModel):
-    """Result to be flown again for another reason than a changed behaviour."""
-
-    result: str = Field(description="its name")
-    commit: str = Field(pattern=r"^[0-9a-f]{40}$", description="of the code that flew it")
-    why: str = Field(min_length=1, description="end of the sentence `Flown on ..., `")
-
-
 class _Changes(ProfileModel):
     change: tuple[Change, ...] = ()
-    withdrawn: tuple[Withdrawn, ...] = ()
 
 
 @cache
 def read_changes(path: Path) -> Mapping[str, Change]:
     """Return the accepted changes by the previous fingerprint. Raises UsageError if damaged."""
     return {each.before: each for each in validated(_Changes, read_toml(path), path).change}
-
-
-@cache
-def read_withdrawn(path: Path) -> Mapping[tuple[str, str | None], str]:
-    """Return the reasons for withdrawing results, by name and commit. Raises UsageError."""
-    withdrawn = validated(_Changes, read_toml(path), path).withdrawn
-    return {(each.result, each.commit): each.why for each in withdrawn}
 
 
 def stands(

@@ -14,7 +14,7 @@ from airl_mav.flight.statistics import Estimate
 from airl_mav.policy.registry import POLICIES, find_policy, policy_names
 from airl_mav.training.config import check_seeds
 from published.behaviour import read_behaviour
-from published.changes import read_changes, read_withdrawn, stands
+from published.changes import read_changes, stands
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
@@ -166,8 +166,6 @@ def out_of_date(record: Record) -> str:
     """Return a sentence on why figures are outdated; empty: up to date."""
     made, runs = record.made, [(run.level, run.arena) for run in record.runs.values()]
     flown = f"Flown on {made.date} with version {made.version}"
-    if why := read_withdrawn(CHANGES_FILE).get((record.name, made.commit)):
-        return f"{flown}, {why}."
     changes = read_changes(CHANGES_FILE)
     if not stands(made.behaviour, behaviour_today(), changes, record.name, runs):
         return f"{flown}, before today's flight behaviour."

@@ -20,7 +20,6 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.training.config import HELD_OUT_SEED, SELECTION_SEED, check_seeds
 from published import declared, record
-from published.changes import read_withdrawn
 from published.collect import collect
 from tests.support.command_line import airl
 from tests.support.processes import ROOT
@@ -122,19 +121,6 @@ def test_flights_with_them_are_not_collected(
     result = {"name": "x", "what": "y", "command": "airl evaluate", "kind": "run", "minutes": 1}
     with pytest.raises(UsageError, match=rf"{field} {seed}: accepted: 0 to {greatest}; {WHY}"):
         collect(declared.Declared.model_validate(result), tmp_path, "f" * 16)
-
-
-def test_results_flown_on_them_are_marked() -> None:
-    withdrawn = read_withdrawn(record.CHANGES_FILE)
-    assert {name for name, _ in withdrawn} == {"compensation-model", "quantisation"}
-    for (name, commit), why in withdrawn.items():
-        found = record.read_record(name)
-        # Remove an entry of changes.toml after its result was flown again.
-        assert found.made.commit == commit
-        assert record.out_of_date(found).endswith(f", {why}.")
-        again = found.made.model_copy(update={"commit": "0" * 40})
-        flown_again = found.model_copy(update={"made": again})
-        assert why not in record.out_of_date(flown_again)
 
 
 def test_evaluation_takes_any_seed() -> None:
