@@ -35,6 +35,7 @@ from airl_mav.profiles.vehicle import WindSettings
 from airl_mav.report.document import Column, TableView, print_table, write_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from airl_mav.training.config import check_seeds
 from companion.limits import REASONS
 from published.record import behaviour_today
 
@@ -151,6 +152,7 @@ def view_of(rows: Sequence[dict[str, str]]) -> TableView:
 def main(words: Sequence[str] | None = None) -> int:
     """Fly missing flights, and count."""
     asked, console = tyro.cli(Command, args=words, description=__doc__), new_console()
+    check_seeds(asked.seed, -(-asked.flights // len(PAIRS)))
     behaviour, deciding = behaviour_today(), dict(PAIRS)
     path = asked.out / FLIGHTS_FILE
     lines = FlownLines(path, COLUMNS)

@@ -74,7 +74,8 @@ class BlackBoxFile(McapFile):
     def __init__(self, path: Path, run: Mapping[str, Any]) -> None:
         """Open a new file; raise OSError if it exists or cannot be written."""
         self.path = path
-        self._file = path.open("xb")
+        path.touch(mode=0o600, exist_ok=False)
+        self._file = path.open("wb")
         super().__init__(self._file, run, in_chunks=False)
 
     def sync(self) -> None:

@@ -114,6 +114,7 @@ class ChildProcess:
         guard = [sys.executable, "-m", "airl_mav.core.child_process"] if guarded else []
         path = {"PYTHONPATH": os.pathsep.join(sys.path)} if guarded else {}
         self.log = log
+        log.touch(mode=0o600)
         with log.open("ab") as file:
             self._log_start = file.tell()
             self._process = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell

@@ -53,6 +53,16 @@ def replace_file(path: Path, data: bytes) -> None:
         partial.write_bytes(data)
 
 
+def private(path: Path) -> Path:
+    """Create a file if it is missing, and let only its owner access it (mode 0600). Return `path`.
+
+    Raises OSError.
+    """
+    path.touch(mode=0o600)
+    path.chmod(0o600)
+    return path
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary name for a file, which then replaces `path`. Raises as `replace_file`."""
@@ -398,7 +408,7 @@ class LogFile:
         self._buffer = bytearray()
         self._written = 0
         self._flushed_us: int | None = None
-        self._file = self.partial_path.open("wb", buffering=0)
+        self._file = private(self.partial_path).open("wb", buffering=0)
 
     @property
     def size_bytes(self) -> int:

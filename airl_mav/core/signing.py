@@ -11,7 +11,6 @@ import contextlib
 import functools
 import hashlib
 import hmac
-import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ from pathlib import Path
 from airl_mav.core.clock import Clock, WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.files import replace_file
+from airl_mav.core.files import private, replace_file, replacing
 
 KEY_BYTES = 32
 SIGNATURE_BYTES = 13
@@ -202,14 +201,8 @@ def read_key(path: Path) -> bytes:
 
 def write_key(path: Path, key: bytes) -> None:
     """Write a key atomically to a file that only its owner can read. Raises OSError."""
-    partial = path.with_name(path.name + ".partial")
-    partial.unlink(missing_ok=True)
-    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(key.hex() + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    with replacing(path) as partial:
+        private(partial).write_text(key.hex() + "\n", encoding="ascii")
 
 
 class StoredSigning:

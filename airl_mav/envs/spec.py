@@ -96,9 +96,8 @@ class CameraChange(ProfileModel):
     def of(self, camera: Camera) -> Camera:
         """Return a vehicle's camera with the changes. Raises FieldError for a mismatch."""
         made = camera.model_copy(update=self.model_dump(exclude_none=True))
-        fov_deg = made.horizontal_fov_deg
-        projections.check_fov("camera.horizontal_fov_deg", made.projection, fov_deg)
-        projections.check_distortion("camera.distortion", made.projection, fov_deg, made.distortion)
+        field, fov_deg = "camera.horizontal_fov_deg", made.horizontal_fov_deg
+        projections.check_lens(field, made.projection, fov_deg, made.distortion)
         check_matched("camera.kind", made)
         check_rows("camera.height_px", made)
         return made

@@ -102,10 +102,8 @@ class SeenCamera(ProfileModel):
 
     @model_validator(mode="after")
     def _sees(self) -> SeenCamera:
-        projections.check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        projections.check_distortion(
-            "distortion", self.projection, self.horizontal_fov_deg, self.distortion
-        )
+        fov_deg = self.horizontal_fov_deg
+        projections.check_lens("horizontal_fov_deg", self.projection, fov_deg, self.distortion)
         return self
 
     @property
@@ -155,10 +153,8 @@ class ObservationSpec(ProfileModel):
     def _fits_the_layout(self) -> ObservationSpec:
         if (problem := layout_of(self.layout).problem(self)) is not None:
             raise ValueError(problem)
-        projections.check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        projections.check_distortion(
-            "distortion", self.projection, self.horizontal_fov_deg, self.distortion
-        )
+        fov_deg = self.horizontal_fov_deg
+        projections.check_lens("horizontal_fov_deg", self.projection, fov_deg, self.distortion)
         return self
 
     @property

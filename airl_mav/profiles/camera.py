@@ -130,10 +130,8 @@ class Camera(ProfileModel):
 
     @model_validator(mode="after")
     def _projects(self) -> Camera:
-        projections.check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        projections.check_distortion(
-            "camera.distortion", self.projection, self.horizontal_fov_deg, self.distortion
-        )
+        field, fov_deg = "camera.horizontal_fov_deg", self.horizontal_fov_deg
+        projections.check_lens(field, self.projection, fov_deg, self.distortion)
         check_rows("camera.height_px", self)
         if self.stereo is not None and not projections.PROJECTIONS[self.projection].planar:
             raise FieldError(

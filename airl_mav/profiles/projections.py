@@ -393,22 +393,20 @@ else:
 """Projection of directions to the image, a name in `PROJECTIONS`."""
 
 
-def check_fov(field: str, projection: Projection, horizontal_fov_deg: float) -> None:
-    """Raise FieldError, naming the field, for a field of view [deg] beyond a projection's limit."""
-    if PROJECTIONS[projection].accepts(horizontal_fov_deg):
-        return
-    limits = [f"{model.accepted_fov} with {name!r}" for name, model in PROJECTIONS.items()]
-    accepted = ", ".join(limits).replace(" with ", " with projection ", 1)
-    raise errors.FieldError(field, horizontal_fov_deg, accepted)
-
-
-def check_distortion(
-    field: str, projection: Projection, horizontal_fov_deg: float, k: Distortion
+def check_lens(
+    fov_field: str, projection: Projection, horizontal_fov_deg: float, k: Distortion
 ) -> None:
-    """Raise FieldError, naming the field, for invalid coefficients."""
+    """Raise FieldError for a field of view [deg] beyond a projection's limit, or invalid `k`.
+
+    `k` is the field `distortion` beside the named field of view.
+    """
+    if not PROJECTIONS[projection].accepts(horizontal_fov_deg):
+        limits = [f"{model.accepted_fov} with {name!r}" for name, model in PROJECTIONS.items()]
+        accepted = ", ".join(limits).replace(" with ", " with projection ", 1)
+        raise errors.FieldError(fov_field, horizontal_fov_deg, accepted)
     if k == UNDISTORTED:
         return
-    shown = [float(each) for each in k]
+    field, shown = ".".join([*fov_field.split(".")[:-1], "distortion"]), [float(each) for each in k]
     if not PROJECTIONS[projection].distorted_magic:
         raise errors.FieldError(
             field, shown, f"left out with projection {projection!r}, only of a fisheye"

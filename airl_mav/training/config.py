@@ -20,6 +20,9 @@ from airl_mav.training.algorithm_table import CORE_ALGORITHMS, ActionKind, Algor
 SELECTION_SEED = 500_000
 """First seed of the selection episodes; training starts at a million, evaluation at one."""
 
+HELD_OUT_SEED = 900_000
+"""First seed held out for the final evaluation; training draws arenas from 1,000,000 on."""
+
 ALGORITHMS: dict[str, Algorithm] = CORE_ALGORITHMS | {
     name: load(place) for name, place in entries("airl_mav", "ALGORITHMS").items()
 }
@@ -30,6 +33,13 @@ NetworkKind = Annotated[str, part_name(NETWORKS, SHIPPED_NETWORKS)]
 Precision = Literal["float32", "bfloat16"]
 ExpertName = Literal["greedy", "planner", "gates"]
 Option = bool | int | float | str | list[int | float | str]
+
+
+def check_seeds(seed: int, count: int = 1, field: str = "seed") -> None:
+    """Raise FieldError if one of `count` seeds from `seed` on is held out."""
+    if seed > (greatest := HELD_OUT_SEED - count):
+        why = f"seeds from {HELD_OUT_SEED} on are held out for the final evaluation"
+        raise FieldError(field, seed, f"0 to {greatest}; choose a lower one: {why}")
 
 
 def kind_of(actions: str) -> ActionKind:
@@ -242,6 +252,7 @@ class TrainingConfig(ProfileModel):
 
     @model_validator(mode="after")
     def _chooses_from_the_action_set(self) -> TrainingConfig:
+        check_seeds(self.seed)
         # A custom set is checked at the start of training: reading a file runs no code.
         if self.environment.actions in SHIPPED:
             check_actions(self.algorithm.name, kind_of(self.environment.actions))

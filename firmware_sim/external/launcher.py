@@ -140,18 +140,13 @@ class Launcher:
 
     def _keep_flight_log(self) -> None:
         path, self.flight_log = self.flight_log, None
-        written = (
-            None if self._folders is None or path is None else self._folders.newest(path.suffix)
-        )
-        if path is None or written is None:
+        if path is None or self._folders is None:
             return
-        partial = path.with_name(path.name + files.PARTIAL_SUFFIX)
-        try:
-            shutil.copyfile(written, partial)
-            partial.replace(path)
-        except OSError:
-            # Disk full: the flight is valid without this log.
-            partial.unlink(missing_ok=True)
+        if (written := self._folders.newest(path.suffix)) is None:
+            return
+        # Disk full: the flight is valid without this log.
+        with suppress(OSError), files.replacing(path) as partial:
+            shutil.copyfile(written, files.private(partial))
 
     def close(self) -> None:
         """Stop the firmware and remove temporary folders."""

@@ -212,15 +212,9 @@ class FirmwareObserver:
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return the traffic counters."""
-        return {
-            self._name: LinkCounters(
-                self._rx,
-                self._tx,
-                self._decoder.malformed,
-                self._ignored + self._decoder.unknown,
-                self._endpoint.send_errors,
-            )
-        }
+        decoder, errors = self._decoder, self._endpoint.send_errors
+        ignored = self._ignored + decoder.unknown
+        return {self._name: LinkCounters(self._rx, self._tx, decoder.malformed, ignored, errors)}
 
     def close(self) -> None:
         """Close the endpoint."""

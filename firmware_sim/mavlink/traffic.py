@@ -13,12 +13,16 @@ from pathlib import Path
 
 from airl_mav.core.files import LogFile
 from firmware_sim.mavlink.clients import Client
-from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
+from firmware_sim.mavlink.codec import COMPONENT_ID, Encoder, WireMessage, dialect, layout, trimmed
 from firmware_sim.mavlink.services import ANY, sender
 
 _TIME = struct.Struct(">Q")
 _LINK_BITS = 0b11
 """Low bits of a time stamp, where MAVProxy stores a link number; always 0 here."""
+
+_SETUP_SIGNING = layout("SETUP_SIGNING")
+_KEY_START = 10
+"""Offset of the key in the payload of SETUP_SIGNING, after time stamp and target."""
 
 MAX_LOGS = 16
 """Maximum number of additional logs per flight."""
@@ -38,20 +42,24 @@ class TlogWriter(LogFile):
         `start_unix_us` is the calendar time of simulated time 0 [µs since 1970, UTC].
         """
         super().__init__(path, on_lost)
-        self._start_unix_us = start_unix_us
-
-    def beside(self, name: str) -> TlogWriter:
-        """Open an additional log: flight-001.NAME.tlog next to flight-001.tlog.
-
-        Raises OSError.
-        """
-        path = self.path.with_name(f"{self.path.stem}.{name}{self.path.suffix}")
-        return TlogWriter(path, self._start_unix_us, self.on_lost)
+        self.start_unix_us = start_unix_us
 
     def write(self, time_us: int, *frames: bytes) -> None:
         """Add frames sent or received at simulated `time_us` [µs]."""
-        stamp = _TIME.pack(self._start_unix_us + time_us & ~_LINK_BITS)
-        self.add(time_us, *(part for frame in frames for part in (stamp, frame)))
+        stamp = _TIME.pack(self.start_unix_us + time_us & ~_LINK_BITS)
+        for frame in frames:
+            # MAVLink 1 has no ids above 255.
+            secret = frame[0] == 0xFD and frame[7:10] == _SETUP_SIGNING.id_bytes
+            self.add(time_us, stamp, _without_key(frame) if secret else frame)
+
+
+def _without_key(frame: bytes) -> bytes:
+    """Return a MAVLink 2 frame of SETUP_SIGNING with a zeroed key and without signature."""
+    # A valid frame suits tlog readers best: they show the message, its sender and time, and find no
+    # gap in the sequence numbers. The signature covers the key, so it would be wrong.
+    encoder = Encoder(frame[5], frame[6])
+    encoder.skip(frame[4])
+    return encoder.frame(_SETUP_SIGNING, trimmed(frame[10 : 10 + min(frame[1], _KEY_START)]))
 
 
 class TrafficLog:
@@ -81,9 +89,11 @@ class TrafficLog:
             return
         name = client.link.name
         self._names[name] += 1
-        number = self._names[name]
+        number = "" if self._names[name] == 1 else f"-{self._names[name]}"
+        # flight-001.NAME.tlog next to flight-001.tlog
+        path = main.path.with_name(f"{main.path.stem}.{name}{number}{main.path.suffix}")
         try:
-            tlog = main.beside(name if number == 1 else f"{name}-{number}")
+            tlog = TlogWriter(path, main.start_unix_us, main.on_lost)
         except OSError:
             self._main = None  # disk full: the flight continues without new logs
             return
@@ -174,9 +184,6 @@ sequence numbers: a sender of heartbeats alone repeats its frames after that."""
 
 REMEMBERED_SENDERS = 256
 
-NEVER = frozenset((dialect.MAVLINK_MSG_ID_SETUP_SIGNING,))
-"""Messages that are never forwarded. A signing key is for its recipient only."""
-
 
 class Forwarder:
     """Message forwarder. Sends each frame once: programs that join two links cause no loop."""
@@ -197,7 +204,8 @@ class Forwarder:
         """
         # Messages without target fields are broadcasts.
         target = getattr(message, "target_system", ANY), getattr(message, "target_component", ANY)
-        if target == (system_id, COMPONENT_ID) or message.get_msgId() in NEVER:
+        # A signing key is for its recipient only.
+        if target == (system_id, COMPONENT_ID) or message.get_type() == "SETUP_SIGNING":
             return False
         if not origin.forwards.left(now_us):
             return False

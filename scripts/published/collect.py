@@ -22,6 +22,7 @@ from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, load_comparison
 from airl_mav.report.document import SCHEMA, TABLE_FILE
+from airl_mav.training.config import check_seeds
 from published.declared import Declared
 from published.record import (
     MEASURES,
@@ -211,6 +212,7 @@ def _runs(comparison: Comparison, folder: Path) -> Iterator[tuple[str, FlownRun,
 
 def _run(quality: Aggregate, info: RunInfo, t2_us: float | None) -> FlownRun:
     asked = info.config
+    check_seeds(asked.get("arena_seed") or 0, field="arena_seed")
     workload = None if asked["workload"] is None else f"{asked['computer']}/{asked['workload']}"
     return FlownRun(
         policy=info.setup.policy.name,

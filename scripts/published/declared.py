@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Literal
@@ -11,10 +12,11 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, validated
+from airl_mav.training.config import check_seeds
 from published.record import RESULTS
 
 DECLARED_FILE = RESULTS / "results.toml"
@@ -51,6 +53,13 @@ class Declared(ProfileModel):
     )
     cards: bool = Field(default=False, description="its runs go onto the cards of their policies")
     minutes: float = Field(gt=0, description="on two cores, about")
+
+    @model_validator(mode="after")
+    def _seeds_are_not_held_out(self) -> Declared:
+        # Checked before the flights, which take hours. The runs of a result are checked again.
+        for option, seed in re.findall(r"--((?:arena-)?seed)[ ='\"]+([\d_]+)", self.command):
+            check_seeds(int(seed), field=f"{self.name}: --{option}")
+        return self
 
 
 def read_declared(path: Path = DECLARED_FILE) -> dict[str, Declared]:

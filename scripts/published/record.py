@@ -12,6 +12,7 @@ from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json, write_json
 from airl_mav.flight.statistics import Estimate
 from airl_mav.policy.registry import POLICIES, find_policy, policy_names
+from airl_mav.training.config import check_seeds
 from published.behaviour import read_behaviour
 from published.changes import read_changes, stands
 
@@ -59,6 +60,11 @@ class FlownRun(ProfileModel):
     flight_time_s: Figure = Field(description="this and the following: flights with success")
     distance_m: Figure
     energy_j: Figure = Field(description="of the vehicle, without its computer")
+
+    @model_validator(mode="after")
+    def _seeds_are_not_held_out(self) -> FlownRun:
+        check_seeds(self.seed, self.success_rate.n)
+        return self
 
 
 class Gap(ProfileModel):

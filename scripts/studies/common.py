@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, model_validator
 from rich.console import Console
 
 from airl_mav.cli import train_command
@@ -30,6 +30,7 @@ from airl_mav.profiles.loading import list_profiles, read_toml
 from airl_mav.report.document import with_interval
 from airl_mav.report.measures import rate_digits
 from airl_mav.scenario.model import LevelName, Scenario
+from airl_mav.training.config import check_seeds
 
 
 class StudyOptions(BaseModel):
@@ -43,12 +44,24 @@ class OneGoal(ProfileModel):
     arena_seed: int = quantity("seed of the arena and the goal", "1", ge=0, le=2**31)
     episodes: int = quantity("flights of each run", "1", ge=1, le=10_000, default=100)
 
+    @model_validator(mode="after")
+    def _arena_is_not_held_out(self) -> OneGoal:
+        check_seeds(self.arena_seed, field="one_goal.arena_seed")
+        return self
+
 
 class StudyConfig(Scenario):
     description: str = Field(default="", description="one line for people")
     level: LevelName = Field(default="gym", description="fidelity level")
     episodes: int = quantity("episodes of each run", "1", ge=1, le=100_000, default=1000)
     quick: dict[str, Any] = Field(default={"episodes": 40}, description="changes by --quick")
+
+    @model_validator(mode="after")
+    def _seeds_are_not_held_out(self) -> StudyConfig:
+        check_seeds(self.seed, self.episodes)
+        if self.arena_seed is not None:
+            check_seeds(self.arena_seed, field="arena_seed")
+        return self
 
 
 Config = TypeVar("Config", bound=StudyConfig)

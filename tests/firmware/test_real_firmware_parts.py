@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
+import stat
 import struct
 import subprocess
 import sys
@@ -520,7 +521,9 @@ def test_a_firmwares_own_log_is_kept_when_its_flight_has_ended(tmp_path: Path) -
     launcher.flight_log = tmp_path / "flight-000.ulg"
     assert not launcher.flight_log.exists()
     launcher.close()
-    assert (tmp_path / "flight-000.ulg").read_text() == "whole\n"
+    kept = tmp_path / "flight-000.ulg"
+    assert kept.read_text() == "whole\n"
+    assert stat.S_IMODE(kept.stat().st_mode) == 0o600
     assert not list(tmp_path.glob("*.part"))
 
 

@@ -321,7 +321,7 @@ def episodes_of(folder: Path) -> dict[int, dict[str, Any]]:
 def test_an_untrained_for_latency_costs_little_once_it_is_compensated(tmp_path: Path) -> None:
     """The paper's 396 ms: of 60 seeds `static-obstacles` loses few, and flies hardly longer."""
     words = ["static-obstacles", "--latencies", "11ms", "396ms", "--compensated"]
-    words += ["--episodes", "60", "--seed", "900000", "--out", str(tmp_path)]
+    words += ["--episodes", "60", "--seed", "700000", "--out", str(tmp_path)]
     with patch.object(show, "write_document", lambda _, folder: folder / "latency-sweep.html"):
         code, text = airl("latency-sweep", *words)
     assert code == 0

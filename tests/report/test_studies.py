@@ -256,7 +256,7 @@ def test_compensation_says_what_flies_how(tmp_path: Path) -> None:
     for compensate in (None, False, True):
         asked = Scenario(
             level="gym",
-            seed=900_000,
+            seed=700_000,
             episodes=3,
             latency="11ms" if compensate is None else "396ms",
             compensate=compensate,
@@ -264,11 +264,16 @@ def test_compensation_says_what_flies_how(tmp_path: Path) -> None:
         with patch.object(show, "write_document", lambda _, folder: folder / "matrix.html"):
             evaluate(asked, ["static-obstacles"], out=tmp_path / f"{compensate}")
         (path,) = (tmp_path / f"{compensate}").rglob("episodes.jsonl")
-        flown = flights(path.parent).values()
-        times[compensate] = [flight["quality"]["flight_time_s"] for flight in flown]
+        times[compensate] = {
+            seed: flight["quality"]["flight_time_s"]
+            for seed, flight in flights(path.parent).items()
+            if flight["outcome"] == "success"
+        }
     for name, compensate in (("not compensated", False), ("compensated", True)):
-        assert rows[name][2] == "3"
-        change = 100.0 * (np.mean(times[compensate]) / np.mean(times[None]) - 1.0)
+        pairs = sorted(times[compensate].keys() & times[None].keys())
+        assert rows[name][2] == f"{len(pairs)}"
+        here, there = ([times[each][seed] for seed in pairs] for each in (compensate, None))
+        change = 100.0 * (np.mean(here) / np.mean(there) - 1.0)
         assert rows[name][1].startswith(f"{change:+.1f} ")
     wrong = [row for name, row in rows.items() if " x 0.5" in name]
     assert len({tuple(row) for row in (*wrong, rows["compensated"])}) > 3
@@ -286,6 +291,24 @@ def test_expected_latencies_of_the_study() -> None:
             latency.measure(np.array([0]), np.array([each]))
         assert high.expected_us()[0] == int(np.quantile(newest, 0.9))
         assert half.expected_us()[0] == pytest.approx(0.5 * newest.mean(), abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        ("seed = 899_990\nepisodes = 11", "seed = 899990"),
+        ("arena_seed = 900_001", "arena_seed = 900001"),
+        ("[one_goal]\narena_seed = 900_000", "one_goal.arena_seed = 900000"),
+    ],
+)
+def test_seeds_of_the_final_evaluation_are_rejected(line: str, field: str, tmp_path: Path) -> None:
+    config = f'policies = ["greedy"]\nlatencies = ["1ms"]\n{line}\n'
+    message = (
+        rf"degradation.toml: {field}: accepted: 0 to \d+; choose a lower one: seeds from 900000"
+    )
+    with pytest.raises(UsageError, match=message):
+        study("degradation", config, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_arena_twice_gets_one_line(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import random
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,7 @@ def whole(tmp_path: Path) -> Path:
 def test_what_was_written_is_read(whole: Path) -> None:
     box = read_black_box(whole)
     assert box.whole
+    assert stat.S_IMODE(whole.stat().st_mode) == 0o600
     assert box.run == RUN
     read = [message for kind in TOPICS for message in box.messages[kind]]
     assert sorted(map(repr, read)) == sorted(map(repr, MESSAGES))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -93,6 +94,7 @@ def state_of(pid: int) -> str:
 
 def test_a_suspended_child_waits_until_it_is_resumed(tmp_path: Path) -> None:
     child = ChildProcess([sys.executable, "-c", SLEEPS], tmp_path / "log")
+    assert stat.S_IMODE((tmp_path / "log").stat().st_mode) == 0o600
     try:
         child.suspend()
         wait_until(lambda: state_of(child.pid) == "T", "stopped")

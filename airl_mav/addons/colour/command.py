@@ -212,10 +212,7 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         if value != RenderOptions.model_fields[name].default:
             problem = "with --camera" if options.camera else "without --camera or --show flow"
             raise FieldError(name, value, problem=problem)
-    projections.check_fov("fov_deg", options.projection, options.fov_deg)
-    projections.check_distortion(
-        "distortion", options.projection, options.fov_deg, options.distortion
-    )
+    projections.check_lens("fov_deg", options.projection, options.fov_deg, options.distortion)
     if options.out is not None and options.out.suffix.lower() == pictures.VIDEO:
         check_installed("film")
     if options.renderer == "mitsuba":

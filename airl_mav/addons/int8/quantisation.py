@@ -38,13 +38,13 @@ from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.scenario.checks import action_generator
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 from airl_mav.scenario.resolve import resolve
+from airl_mav.training.config import check_seeds
 
 METHOD = (
     "static, QDQ: activations uint8, weights int8 by channel, ranges by least and greatest value; "
     "the last layer in floats"
 )
 """Description of the method in a card."""
-
 
 _DENSE = ("Gemm", "MatMul")
 """Operators of dense layers."""
@@ -71,16 +71,13 @@ def quantised(model: bytes, frames: Encoded) -> bytes:
     class Rows(quantization.CalibrationDataReader):  # type: ignore[misc] # untyped
         """Reader of one frame at a time, for minimum memory."""
 
-        def __init__(self) -> None:
-            self._rows = _rows(frames)
+        rows = _rows(frames)
 
         def get_next(self) -> Mapping[str, NDArray[Any]] | None:
-            return next(self._rows, None)
+            return next(self.rows, None)
 
     with tempfile.TemporaryDirectory(prefix="airl-int8-") as scratch, _quiet():
-        floats, shaped, written = (
-            Path(scratch) / f"{name}.onnx" for name in ("floats", "shaped", "int8")
-        )
+        floats, shaped, written = (Path(scratch, f"{n}.onnx") for n in ("floats", "shaped", "int8"))
         floats.write_bytes(model)
         try:
             quant_pre_process(floats, shaped, skip_symbolic_shape=True)
@@ -133,9 +130,8 @@ def _quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-FIRST_SEED = 900_000
-"""First seed of calibration flights. Evaluations start at seed 1, the choice of the best weights at
-500,000, and training at 1,000,000."""
+FIRST_SEED = 800_000
+"""First seed of calibration flights; for other seeds see `training.config`."""
 
 FLIGHTS = 200
 FRAMES, CHECKED = 512, 512
@@ -161,6 +157,7 @@ class _Witness:
 
 def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, int]:
     """Return inputs of a policy on reserved seeds, its training arena, and the last seed."""
+    check_seeds(FIRST_SEED, flights)
     card = load_card(folder)
     arena = card.training.arena or DEFAULT_ARENA
     environment = hardware_gap.training_environment(card) or {}
@@ -206,9 +203,8 @@ def export_int8(
         found = OnnxRuntime(model, card.observation, card.actions).infer(_at(frames, checked))
     except ValueError as error:
         raise UsageError(f"the network in integers: {error}") from None
-    same = None
-    if discrete_actions(card.actions) is not None:
-        same = float(np.mean(found.argmax(axis=1) == wanted.argmax(axis=1)))
+    is_discrete = discrete_actions(card.actions) is not None
+    same = float(np.mean(found.argmax(1) == wanted.argmax(1))) if is_discrete else None
     facts: dict[str, Any] = {
         "name": name or f"{card.name}-int8",
         "description": f"{card.description or card.name}, in 8-bit integers",

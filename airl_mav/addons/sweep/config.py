@@ -15,7 +15,7 @@ from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy import card, card_writing
 from airl_mav.profiles import loading, projections, vehicle
-from airl_mav.training.config import SELECTION_SEED, NetworkSpec, TrainingConfig
+from airl_mav.training.config import SELECTION_SEED, NetworkSpec, TrainingConfig, check_seeds
 
 GREATEST_LAYERS, GREATEST_FILTERS = 16, 256
 """Limits of a template in `training.config.NetworkSpec`."""
@@ -96,6 +96,7 @@ class SweepConfig(fields.ProfileModel):
             raise ValueError(f"grids: arenas {', '.join(names)}: accepted: each name once")
         if len(set(self.seeds)) < len(self.seeds):
             raise ValueError(f"seeds = {list(self.seeds)}: accepted: each number once")
+        check_seeds(max(self.seeds), field="seeds")
         for table, field, what in (
             (self.training, "network", "every template of the grids"),
             (self.training, "seed", "each of seeds"),
