@@ -161,8 +161,7 @@ def shot(page: Page) -> Image.Image:
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "page.png"
         page.screenshot(path)
-        with Image.open(path) as image:
-            return image.convert("RGB")
+        return Image.open(path).convert("RGB")
 
 
 def save(name: str, data: io.BytesIO) -> None:
