@@ -158,7 +158,7 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
         # Imported here: only pictures need matplotlib, which is slow to import.
         from airl_mav.arena.draw import save_png
 
-        try:
+        with errors.usage_errors(f"--png {options.png}: cannot write"):
             save_png(
                 arena,
                 options.png,
@@ -166,8 +166,5 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
                 goal_radius_m=options.goal_radius_m,
                 zone_radii_m=spec.zones_m,
             )
-        except OSError as error:
-            problem = f"cannot write: {error.strerror}"
-            raise errors.FieldError("png", f"{options.png}", problem=problem) from None
         console.print(f"picture: {options.png}", soft_wrap=True, highlight=False)
     return 0

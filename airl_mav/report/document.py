@@ -187,15 +187,13 @@ def draw_section(section: Section, folder: Path) -> tuple[Section, tuple[FigureI
 
 def write_document(document: Document, folder: Path) -> Path:
     """Write page, Markdown and PNG files, each atomically; return the page's path."""
-    try:
+    with errors.usage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         drawn = [draw_section(section, folder) for section in document.sections]
         files.replace_file(folder / f"{document.name}.md", markdown(document).encode())
         template = environment().get_template("document.html.j2")
         path = folder / f"{document.name}.html"
         files.replace_file(path, template.render(document=document, sections=drawn).encode())
-    except OSError as error:
-        raise errors.UsageError(f"{folder}: {error.strerror}") from None
     return path
 
 

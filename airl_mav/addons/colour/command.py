@@ -20,7 +20,7 @@ from airl_mav.camera import intrinsics, render
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import COMMON, ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress, new_console
@@ -183,11 +183,8 @@ def run(options: RenderOptions, console: Console | None = None) -> int:
     filmed = path.is_dir() or path.suffix == SUFFIX
     _check(options, filmed)
     out = options.out or Path("render.gif" if filmed else "render.png")
-    try:
+    with usage_errors(f"--out {out}: cannot write"):
         told = _film(options, path, out, console) if filmed else _picture(options, out)
-    except OSError as error:
-        problem = f"cannot write: {error.strerror}"
-        raise FieldError("out", f"{out}", problem=problem) from None
     console.print(f"{told}: {out}", soft_wrap=True, highlight=False)
     return 0
 

@@ -14,7 +14,7 @@ from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replacing
 from airl_mav.core.progress import RichProgress, new_console
@@ -75,10 +75,8 @@ def run(options: ExportLogOptions, console: Console | None = None) -> int:
     if options.stream:
         return _stream(replayed, numbers, options.port, console)
     out = options.out or folder
-    try:
+    with usage_errors(f"--out {out}"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FieldError("out", f"{out}", problem=f"{error.strerror}") from None
     with RichProgress(console) as progress:
         bar = progress.bar("flights", len(numbers), unit="flights")
         for number in numbers:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.files import replace_file
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
@@ -224,13 +224,11 @@ def export_int8(
         ),
     }
     card = PolicyCard.model_validate({**dict(card), **facts})
-    try:
+    with usage_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         replace_file(out / ONNX_FILE, model)
         write_card(out, card)
         (out / TORCH_FILE).unlink(missing_ok=True)
-    except OSError as error:
-        raise UsageError(f"{out}: {error.strerror}") from None
     return card
 
 

@@ -81,13 +81,9 @@ def run(options: AssetOptions, console: Console | None = None) -> int:
             (Path(folder) / path.name).write_bytes(data)
         # Validate before writing the files.
         load_profile("arenas", str(Path(folder) / options.out.name), ArenaSpec)
-    try:
+    with errors.usage_errors(f"--out {options.out}: cannot write"):
         for path, data in files.items():
             replace_file(path, data)
-    except OSError as error:
-        raise errors.FieldError(
-            "out", f"{options.out}", problem=f"cannot write: {error.strerror}"
-        ) from None
     seen = "the boxes" if surface is None else f"its {len(made.surface):,} triangles"
     console.print(
         f"{name}: {_told(made)}; cameras see {seen}",

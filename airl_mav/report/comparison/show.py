@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
@@ -136,11 +136,9 @@ def _saved(
 ) -> Document:
     """Write the data and the verdict of a comparison; return its document."""
     verdict = verdict or judge_comparison(comparison, loaded, run_verdict.requirements_of(folder))
-    try:
+    with usage_errors(folder):
         comparison_model.save_comparison(comparison, folder)
         run_verdict.save_verdict(verdict, folder)
-    except OSError as error:
-        raise UsageError(f"{folder}: {error.strerror}") from None
     return comparison_to_document(comparison, loaded, folder, verdict)
 
 
