@@ -6,7 +6,6 @@ draw flights at 2.5 or above. The legend has one artist per kind.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -106,10 +105,9 @@ def save_png(
 
 def write_png(figure: Figure, path: Path, dpi: int = 150) -> None:
     """Write a figure atomically."""
-    picture = io.BytesIO()
     FigureCanvasAgg(figure)
-    figure.savefig(picture, format="png", dpi=dpi)
-    files.replace_file(path, picture.getvalue())
+    with files.replacing(path) as partial:
+        figure.savefig(partial, format="png", dpi=dpi)
 
 
 def _draw_floor(arena: geometry.Arena, ax: Axes) -> None:

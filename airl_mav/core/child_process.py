@@ -114,8 +114,10 @@ class ChildProcess:
         guard = [sys.executable, "-m", "airl_mav.core.child_process"] if guarded else []
         path = {"PYTHONPATH": os.pathsep.join(sys.path)} if guarded else {}
         self.log = log
-        log.touch(mode=0o600)
-        with log.open("ab") as file:
+        # Imported here: guards need none of it.
+        from airl_mav.core.files import open_to_append
+
+        with open_to_append(log, 0o600) as file:
             self._log_start = file.tell()
             self._process = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell
                 [*guard, *argv],

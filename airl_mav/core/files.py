@@ -1,33 +1,38 @@
 """Files that survive kills, full disks and bit errors: atomic writes, checked reads.
 
 A file is written under a temporary name, synced to the disk and renamed. A reader sees the old file
-or the complete new file. JSON objects contain their CRC-32 in the field `crc32`; archive members
-have a CRC by format. Damaged data is rejected on reading with one line. Files without the field, by
-earlier versions of this package or edited by hand, are read unchecked. A `LogFile` grows during a
-flight, under a temporary name until it is complete.
+or the complete new file. A run folder may come from an untrusted source: links in it are replaced
+or rejected. JSON objects contain their CRC-32 in the field `crc32`; archive members have a CRC by
+format. Damaged data is rejected on reading with one line. Files without the field, by earlier
+versions of this package or edited by hand, are read unchecked. A `LogFile` grows during a flight,
+under a temporary name until it is complete.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import hashlib
 import io
 import json
 import os
+import secrets
 import shutil
+import stat
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar
+from typing import IO, Any, Literal, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.fields import field_error
 
 T = TypeVar("T")
@@ -42,33 +47,30 @@ DEEPEST = 100
 
 # --- whole files
 
+TEMPORARY_SUFFIX = ".partial"
+"""Suffix of temporary files; a killed process leaves them behind."""
 
-def replace_file(path: Path, data: bytes) -> None:
+
+def replace_file(path: Path, data: bytes, mode: int = 0o666) -> None:
     """Write a file atomically: a reader sees the old file or the complete new file.
 
     Raises OSError if writing fails, for example on a full disk, with the path as `filename`. The
     old file is then unchanged, and no temporary file remains.
     """
-    with replacing(path) as partial:
+    with replacing(path, mode) as partial:
         partial.write_bytes(data)
 
 
-def private(path: Path) -> Path:
-    """Create a file if it is missing, and let only its owner access it (mode 0600). Return `path`.
-
-    Raises OSError.
-    """
-    path.touch(mode=0o600)
-    path.chmod(0o600)
-    return path
-
-
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary name for a file, which then replaces `path`. Raises as `replace_file`."""
-    partial = path.with_name(path.name + ".partial")
+def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
+    """Yield a new, empty file, which then replaces `path`. Raises as `replace_file`.
+
+    A link at `path` is replaced, not followed. `mode` are the permissions before the umask.
+    """
+    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
     try:
         with naming(path):
+            partial.touch(mode, exist_ok=False)  # O_EXCL does not follow links
             yield partial
             sync(partial)
             partial.replace(path)
@@ -105,6 +107,49 @@ def sync_folder(path: Path) -> None:
         sync(path)
 
 
+def open_to_append(path: Path, mode: int = 0o666) -> IO[bytes]:
+    """Open a file at its end; create it with a mode (before the umask) if missing.
+
+    Raises UsageError for a symbolic link, a file with several hard links, or no regular file.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, mode)
+        found = os.fstat(descriptor)
+        if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
+            return os.fdopen(descriptor, "ab")
+        os.close(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EISDIR, errno.ELOOP, errno.ENXIO):
+            raise
+    raise UsageError(
+        f"{path}: a link, or no regular file; accepted: a regular file without links; delete "
+        f"{path.name}, or put a copy of the file in its place"
+    )
+
+
+def subfolder(folder: Path, name: str) -> Path:
+    """Return the path of a folder below a folder. Raises UsageError for a link below `folder`."""
+    for part in Path(name).parts:
+        folder = folder / part
+        if folder.is_symlink():
+            raise UsageError(
+                f"{folder}: a link; accepted: a folder; delete the link, or put a copy of the "
+                "folder in its place"
+            )
+    return folder
+
+
+def try_lock(descriptor: int) -> bool:
+    """Lock a file or folder; return False if another process has locked it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True  # Some network file systems have no locks: nothing stops a second process.
+    return True
+
+
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal. Raises OSError."""
     with path.open("rb") as file:
@@ -130,10 +175,8 @@ def read_json(path: Path, schema: int | None, what: str) -> dict[str, Any]:
     folder's content in messages. Raises UsageError if the file is missing, not JSON, damaged, or of
     another version.
     """
-    try:
+    with usage_errors(f"{path.parent}: no {what} here: {path.name}"):
         data = path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{path.parent}: no {what} here: {path.name}: {error.strerror}") from None
     try:
         return _opened(data, schema)
     except ValueError as error:
@@ -159,9 +202,10 @@ def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
     Raises:
         ValueError: A NaN or an infinity.
         OSError: Writing failed; the file is unchanged.
+        UsageError: See `open_to_append`.
     """
     data = b"".join(json_line(each) for each in objects)
-    with naming(path), path.open("ab") as file:
+    with naming(path), open_to_append(path) as file:
         before = file.tell()
         try:
             file.write(data)
@@ -184,7 +228,10 @@ def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]
     A last line without a newline was cut short by a kill and is ignored. A missing file gives an
     empty list. For `schema` and errors see `read_json`.
     """
-    *whole, rest = _read_if_there(path).split(b"\n")
+    data = b""
+    with usage_errors(path), suppress(FileNotFoundError):
+        data = path.read_bytes()
+    *whole, rest = data.split(b"\n")
     found = []
     for number, line in enumerate(whole, start=1):
         try:
@@ -200,19 +247,12 @@ def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]
 
 
 def cut_torn_line(path: Path) -> None:
-    """Remove a last line without a newline, so that the file can be appended to."""
-    data = _read_if_there(path)
-    if (whole := data.rfind(b"\n") + 1) != len(data):
-        os.truncate(path, whole)
-
-
-def _read_if_there(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        return b""
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
+    """Remove a last line without a newline. Raises UsageError as `open_to_append`."""
+    if os.path.lexists(path):
+        with open_to_append(path) as file:
+            data = path.read_bytes()
+            if (whole := data.rfind(b"\n") + 1) != len(data):
+                file.truncate(whole)
 
 
 def _compact(data: Mapping[str, Any]) -> bytes:
@@ -298,10 +338,9 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
     the whole run.
     """
     with replacing(path) as partial:
-        old = path.exists()
-        if old:
+        if path.exists():
             shutil.copyfile(path, partial)
-        with _archive(partial, "a" if old else "w") as new:
+        with _archive(partial, "a") as new:
             stale = any(_group_of(member) in groups for member in new.infolist())
             if not stale:
                 _write_groups(new, groups)
@@ -408,7 +447,10 @@ class LogFile:
         self._buffer = bytearray()
         self._written = 0
         self._flushed_us: int | None = None
-        self._file = private(self.partial_path).open("wb", buffering=0)
+        self.partial_path.unlink(missing_ok=True)
+        # O_EXCL does not follow links.
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+        self._file = os.fdopen(os.open(self.partial_path, flags, 0o600), "wb", buffering=0)
 
     @property
     def size_bytes(self) -> int:

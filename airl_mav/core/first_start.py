@@ -7,7 +7,6 @@ resumes where it ended. A record of the source files marks a plan as done.
 
 from __future__ import annotations
 
-import fcntl
 import importlib
 import json
 import os
@@ -25,7 +24,7 @@ from airl_mav.core.child_process import ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.files import replace_file
+from airl_mav.core.files import replace_file, try_lock
 from airl_mav.core.machine import usable_cores
 from airl_mav.core.progress import Bar, Progress
 
@@ -175,20 +174,13 @@ def _locked(folder: Path, progress: Progress, stop: Callable[[], bool]) -> Itera
     clock, said = WallClock(), False
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        while not stop():
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if not said:
-                    what = "waiting for another program that compiles kernels"
-                    progress.status(what)
-                    progress.line(what)
-                said = True
-                clock.sleep_until(clock.time_us() + round(POLL_S * US_PER_S))
-            except OSError:
-                break  # Some network file systems have no locks: both compile.
-            else:
-                break
+        while not stop() and not try_lock(descriptor):
+            if not said:
+                what = "waiting for another program that compiles kernels"
+                progress.status(what)
+                progress.line(what)
+            said = True
+            clock.sleep_until(clock.time_us() + round(POLL_S * US_PER_S))
         if said:
             progress.status(None)
         yield

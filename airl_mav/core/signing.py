@@ -18,7 +18,7 @@ from pathlib import Path
 from airl_mav.core.clock import Clock, WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.files import private, replace_file, replacing
+from airl_mav.core.files import replace_file
 
 KEY_BYTES = 32
 SIGNATURE_BYTES = 13
@@ -201,8 +201,7 @@ def read_key(path: Path) -> bytes:
 
 def write_key(path: Path, key: bytes) -> None:
     """Write a key atomically to a file that only its owner can read. Raises OSError."""
-    with replacing(path) as partial:
-        private(partial).write_text(key.hex() + "\n", encoding="ascii")
+    replace_file(path, f"{key.hex()}\n".encode(), 0o600)
 
 
 class StoredSigning:

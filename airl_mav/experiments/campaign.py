@@ -247,7 +247,7 @@ def run_cells(
     first_of = shared_flights(cells)
     # Equal flights are flown once.
     unique = [cell for cell in cells if first_of[cell.name] is cell]
-    paths = {cell.name: root.absolute() / cell.name for cell in unique}
+    paths = {cell.name: files.subfolder(root.absolute(), cell.name) for cell in unique}
     run = _run(paths, unique, executor, progress or Progress(), stop, ended)
     flown = {each.cell.name: each for each in run.cells}
     shown = [

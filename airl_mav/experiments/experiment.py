@@ -17,7 +17,7 @@ from typing import Any
 from airl_mav.core import addons
 from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import utc_now
-from airl_mav.core.files import Arrays
+from airl_mav.core.files import Arrays, subfolder
 from airl_mav.core.progress import Progress, RichProgress, new_console
 from airl_mav.experiments import campaign
 from airl_mav.experiments.executors import Executor, open_executor
@@ -218,7 +218,8 @@ def _fly_live(
         if (first := first_of[cell.name]) is not cell:
             runs.append(replace(next(run for run in runs if run.cell is first), cell=cell))
             continue
-        flown = fly_live(cell.scenario, root.absolute() / cell.name, progress, name=cell.name)
+        out = subfolder(root.absolute(), cell.name)
+        flown = fly_live(cell.scenario, out, progress, name=cell.name)
         runs.append(campaign.CellRun(cell, flown.path, flown.episodes, flown.new))
         if flown.ended != "complete":
             return campaign.CampaignRun(tuple(runs), False, flown.ended, flown.problem)

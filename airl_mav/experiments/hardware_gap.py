@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
+from airl_mav.core.files import subfolder
 from airl_mav.core.progress import Progress
 from airl_mav.envs.spec import Delay
 from airl_mav.experiments import experiment
@@ -373,7 +374,8 @@ def _fly(
 ) -> FlownRun:
     """Fly the missing episodes among the first n of a cell."""
     asked = cell.scenario.scenario.model_copy(update={"episodes": n})
-    return experiment.fly_scenario(resolve(asked), out / cell.name, progress, executor=executor)
+    run = subfolder(out, cell.name)
+    return experiment.fly_scenario(resolve(asked), run, progress, executor=executor)
 
 
 def _planned(run: Path) -> int:

@@ -6,7 +6,6 @@ docs/reference/run-folder.md describes every file. An episode is committed by it
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -22,7 +21,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core import files
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.files import PARTIAL_SUFFIX
 from airl_mav.core.machine import describe_machine, git_state, package_versions
 from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
@@ -147,10 +146,8 @@ class RunFolder:
     @classmethod
     def adopt(cls, path: Path, info: RunInfo, option: str = "") -> RunFolder:
         """Create the folder of a run from elsewhere. Raises UsageError, after the option's name."""
-        try:
+        with usage_errors(f"{option}{path}"):
             path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{option}{path}: {error.strerror}") from None
         _write_info(path / RUN_FILE, info)
         return cls(path)
 
@@ -182,7 +179,7 @@ class RunFolder:
 
     def sweep(self) -> None:
         """Remove files of unfinished episodes, but keep the logs of a killed firmware."""
-        for pattern in (".*.npz*", f"{LATENCY_FILE}.partial", f"{TRAJECTORIES_FILE}.partial"):
+        for pattern in (".*.npz*", f"*{files.TEMPORARY_SUFFIX}"):
             for leftover in self.path.glob(pattern):
                 leftover.unlink()
         for log in self.path.glob(f"flight-*{PARTIAL_SUFFIX}"):
@@ -359,12 +356,10 @@ def locked(path: Path, say: Callable[[str], None]) -> Iterator[int]:
     The lock ends with the last process that has the yielded descriptor. Waits for the processes of
     a killed run, which hold its ports and may still write.
     """
-    try:
+    with usage_errors(f"--out {path}"):
         path.mkdir(parents=True, exist_ok=True)
         # Locks the folder: a lock file would need cleanup.
         descriptor = os.open(path, os.O_RDONLY)
-    except OSError as error:
-        raise UsageError(f"--out {path}: {error.strerror}") from None
     try:
         _acquire(descriptor, path, say)
         yield descriptor
@@ -373,27 +368,15 @@ def locked(path: Path, say: Callable[[str], None]) -> Iterator[int]:
 
 
 def _acquire(descriptor: int, path: Path, say: Callable[[str], None]) -> None:
-    if _try(descriptor):
+    if files.try_lock(descriptor):
         return
     say(f"{path}: waiting for the processes of an earlier run to end")
     clock = WallClock()
-    while not _try(descriptor):
+    while not files.try_lock(descriptor):
         now_us = clock.time_us()
         if now_us > WAIT_S * US_PER_S:
             raise UsageError(f"--out {path}: another run flies into it; accepted: a new folder")
         clock.sleep_until(now_us + int(POLL_S * US_PER_S))
-
-
-def _try(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        # Some file systems, mainly network ones, do not support locks. Nothing then prevents two
-        # runs in one folder.
-        return True
-    return True
 
 
 MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"

@@ -27,6 +27,7 @@ from PIL import Image
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_COLOUR, STATIC_COLOURS
 from airl_mav.camera.frame import nearness, rgb_of
+from airl_mav.core.files import replacing
 
 NO_RETURN = "#262a30"
 """Colour of pixels without a depth return, as in the live view."""
@@ -222,7 +223,8 @@ def render(figure: Figure, name: str, alt: str) -> FigureImage:
     folder, formats = _FILES.get() or (Path(), ())
     for form in formats:
         metadata = {"CreationDate": None} if form == "pdf" else {"Date": None}
-        figure.savefig(folder / f"{name}.{form}", metadata=metadata)
+        with replacing(folder / f"{name}.{form}") as partial:
+            figure.savefig(partial, format=form, metadata=metadata)
     svg = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(svg, format="svg", dpi=SVG_DPI, metadata={"Date": None, "Creator": None})

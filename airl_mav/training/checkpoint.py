@@ -31,11 +31,11 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import (
     Arrays,
     json_line,
-    naming,
     read_json,
     replace_file,
+    replacing,
+    save_arrays,
     sha256_of,
-    sync,
     sync_folder,
 )
 
@@ -257,18 +257,13 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
 def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None:
     """Write the files of a checkpoint and sync them to disk. Raises OSError."""
     weights, arrays, state = collect(model)
-    keywords: dict[str, Any] = dict(arrays)
-    with naming(partial):
-        with (partial / WEIGHTS).open("wb") as file:
-            torch.save(weights, file)
-        with (partial / ARRAYS).open("wb") as file:
-            np.savez(file, **keywords)
-        (partial / STATE).write_text(json.dumps({"learner": state, "meta": meta}, default=_plain))
-        files = {name: sha256_of(partial / name) for name in (WEIGHTS, ARRAYS, STATE)}
-        (partial / MANIFEST).write_bytes(json_line({"schema": SCHEMA, "files": files}))
-        for path in partial.iterdir():
-            sync(path)
-    sync_folder(partial)
+    with replacing(partial / WEIGHTS) as path, path.open("wb") as file:
+        torch.save(weights, file)
+    save_arrays(partial / ARRAYS, arrays)
+    text = json.dumps({"learner": state, "meta": meta}, default=_plain)
+    replace_file(partial / STATE, text.encode())
+    files = {name: sha256_of(partial / name) for name in (WEIGHTS, ARRAYS, STATE)}
+    replace_file(partial / MANIFEST, json_line({"schema": SCHEMA, "files": files}))
 
 
 def load_latest(

@@ -53,14 +53,14 @@ class TrainingFolder:
     """A training run on disk; it can be read and resumed after a kill at any time."""
 
     def __init__(self, path: Path) -> None:
-        """Wrap a folder; `begin` makes or checks the run in it."""
+        """Wrap a folder; UsageError for a link in it. `begin` makes or checks the run in it."""
         self.path = path
-        self.checkpoints = path / "checkpoints"
-        self.tensorboard = path / "tensorboard"
-        self.best_model = path / "best" / BEST_MODEL
+        self.checkpoints = files.subfolder(path, "checkpoints")
+        self.tensorboard = files.subfolder(path, "tensorboard")
+        self.best_model = files.subfolder(path, "best") / BEST_MODEL
         """Best weights so far, in stable-baselines3's format."""
-        self.zones = path / "zones"
-        self.policy = path / "policy"
+        self.zones = files.subfolder(path, "zones")
+        self.policy = files.subfolder(path, "policy")
 
     @classmethod
     def begin(
@@ -123,7 +123,7 @@ class TrainingFolder:
 
     def zone(self, zone: int) -> Path:
         """Return the folder of the files saved for a curriculum zone."""
-        return self.zones / f"zone-{zone}"
+        return files.subfolder(self.zones, f"zone-{zone}")
 
     def save_best(self, model: bytes, evaluation: Evaluation) -> None:
         """Save the best weights, then their evaluation."""

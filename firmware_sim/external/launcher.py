@@ -145,8 +145,8 @@ class Launcher:
         if (written := self._folders.newest(path.suffix)) is None:
             return
         # Disk full: the flight is valid without this log.
-        with suppress(OSError), files.replacing(path) as partial:
-            shutil.copyfile(written, files.private(partial))
+        with suppress(OSError), files.replacing(path, 0o600) as partial:
+            shutil.copyfile(written, partial)
 
     def close(self) -> None:
         """Stop the firmware and remove temporary folders."""

@@ -77,10 +77,10 @@ real = os.fsync
 """
 
 WINDOWS = {
-    "the settings half written": "before(atomic, 'sync', lambda p: p.name == 'run.json.partial')",
-    "no scenario file": "before(atomic, 'sync', lambda p: p.name == 'scenario.toml.partial')",
+    "the settings half written": "before(atomic, 'sync', lambda p: p.name.startswith('run.json.'))",
+    "no scenario file": "before(atomic, 'sync', lambda p: p.name.startswith('scenario.toml.'))",
     "nothing saved": "before(run_folder.RunFolder, 'save_episodes')",
-    "half an archive": "before(atomic, 'sync', lambda p: p.name == 'latency.npz.partial')",
+    "half an archive": "before(atomic, 'sync', lambda p: p.name.startswith('latency.npz.'))",
     "one archive": "after(atomic, 'add_arrays')",
     "half a line": "os.fsync = tear",
     "a line": "after(run_folder.RunFolder, 'save_episodes')",
@@ -284,7 +284,7 @@ def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:
 def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     """At level gym flights are the same every time: so are runs, killed or not."""
     out, straight = tmp_path / "killed", tmp_path / "straight"
-    page = "before(atomic, 'sync', lambda p: p.name == 'report.html.partial')"
+    page = "before(atomic, 'sync', lambda p: p.name.startswith('report.html.'))"
     draw = f"sys.argv[1:] = ['report', {str(out)!r}]"
     deadly = [f"{KILLER}\n{window}" for window in WINDOWS.values()]
     deadly.append(f"{KILLER}\n{page}\n{draw}")

@@ -136,9 +136,8 @@ def period_ms(rate_hz: float) -> int:
 
 def write_png(path: Path, pixels: Pixels) -> None:
     """Write a picture. Raises OSError."""
-    written = io.BytesIO()
-    Image.fromarray(pixels).save(written, "PNG")
-    files.replace_file(path, written.getvalue())
+    with files.replacing(path) as partial:
+        Image.fromarray(pixels).save(partial, "PNG")
 
 
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
@@ -293,9 +292,8 @@ def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
 
 def write_array(path: Path, array: NDArray[Any]) -> None:
     """Write an array in numpy's format. Raises OSError."""
-    written = io.BytesIO()
-    np.save(written, array)
-    files.replace_file(path, written.getvalue())
+    with files.replacing(path) as partial, partial.open("wb") as file:
+        np.save(file, array)
 
 
 Floats = NDArray[np.float64]

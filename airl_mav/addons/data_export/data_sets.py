@@ -20,6 +20,7 @@ from minari.data_collector import EpisodeBuffer
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.files import replace_file, replacing
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import setpoint_column
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -133,9 +134,10 @@ def write_lerobot(run: LoadedRun, rate_hz: float, out: Path) -> int:
     _write(pyarrow.table(frames), out / "data" / LEROBOT_FILE)
     _write(pyarrow.Table.from_pylist(episodes), out / "meta/episodes" / LEROBOT_FILE)
     # LeRobot reads the tasks as the index of a pandas table.
-    pandas.DataFrame({"task_index": [0]}, index=[TASK]).to_parquet(out / "meta/tasks.parquet")
+    tasks = pandas.DataFrame({"task_index": [0]}, index=[TASK])
+    _write(pyarrow.Table.from_pandas(tasks), out / "meta/tasks.parquet")
     for name, data in (("info", _info(rate_hz, frames, episodes)), ("stats", _stats(frames))):
-        (out / f"meta/{name}.json").write_text(json.dumps(data, indent=4), encoding="utf-8")
+        replace_file(out / f"meta/{name}.json", json.dumps(data, indent=4).encode())
     return len(episodes)
 
 
@@ -145,7 +147,8 @@ _PARTS = ("data", "meta/episodes")
 
 def _write(table: pyarrow.Table, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    pyarrow.parquet.write_table(table, path)
+    with replacing(path) as partial:
+        pyarrow.parquet.write_table(table, partial)
 
 
 def _info(

@@ -50,7 +50,7 @@ def run(options: ExportDataOptions, console: Console | None = None) -> int:
     if options.format != "csv":
         check_installed("data")
     loaded = load(options.run)
-    out = options.out or options.run / f"data-{options.format}"
+    out = options.out or files.subfolder(options.run, f"data-{options.format}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise errors.FieldError("out", f"{out}", problem="exists already; name another folder")
     if options.format in ("csv", "parquet"):

@@ -220,7 +220,7 @@ WITH_LOG = "-with-log"
 def take_in(path: Path, ulg: Path | None = None) -> Path:
     """Return the run folder of a black box and its vehicle's log, created beside it if missing."""
     box = mcap_file.read_black_box(path)
-    folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
+    folder = files.subfolder(path.parent, path.stem + ("" if ulg is None else WITH_LOG))
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if ulg is not None:
         # Imported here: pyulog is an extra.

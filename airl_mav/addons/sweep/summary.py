@@ -52,7 +52,7 @@ class SweepFolder:
 
     def trial_path(self, trial: Trial) -> Path:
         """Return the folder of a trial."""
-        return self.path / trial.name
+        return files.subfolder(self.path, trial.name)
 
     @property
     def evaluation(self) -> dict[str, Any]:
