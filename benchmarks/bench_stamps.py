@@ -35,6 +35,7 @@ from airl_mav.core.constants import CommandKind
 from airl_mav.core.frames import Goal
 from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import DecisionLog
+from airl_mav.policy import actions
 from airl_mav.policy.actions import AnyAction, flyable
 from airl_mav.policy.observation import Kinematics, Observation
 from companion import pilot
@@ -95,7 +96,7 @@ def watched() -> Iterator[list[int]]:
     # Raises AttributeError if the pilot's names change.
     with (
         patch.object(pilot.Pilot, "_observe", encode_timed),
-        patch.object(pilot, "flyable", flyable_timed),
+        patch.object(actions, "flyable", flyable_timed),
     ):
         yield took_ns
 
