@@ -42,7 +42,7 @@ from companion import pilot
 from companion.frame_source import ReceivedFrame
 
 CALLS, REPEATS = 10_000, 50
-FLIGHTS, DECISIONS, WARM_UP = 3, 200, 20
+FLIGHTS, DECISIONS, WARM_UP = 2, 60, 20
 STAMP_LIMIT_US, CHANGE_LIMIT = 0.5, 0.01
 
 READY = "Ctrl-C ends it."
