@@ -179,9 +179,12 @@ def test_every_decision_is_followed_to_the_motors(done: Done, index: int) -> Non
     assert np.all(stamps["capture_us"] > episode["started_us"])
     # (Where the host gave up time, the simulator's clock has seen less of a hold.)
     least_us = HOLD_US - episode["slipped_us"]
-    assert np.all(np.diff(stamps["sent_us"]) >= least_us)
+    # On a busy host the last decisions may be made when the flight has ended, at one time.
+    flown = stamps["sent_us"] < episode["ended_us"]
+    assert flown.sum() >= len(flown) - 2
+    assert np.all(np.diff(stamps["sent_us"][flown]) >= least_us)
     held = archive[f"{index:03d}/held_until_us"] - stamps["sent_us"]
-    assert np.all(held >= least_us)
+    assert np.all(held[flown] >= least_us)
     # The loops hand over within five ticks of 4 ms, but where the host was busy.
     assert np.median((stamps["motor_us"] - stamps["accepted_us"])[followed]) <= 20_000
 
