@@ -47,10 +47,12 @@ class TlogWriter(LogFile):
     def write(self, time_us: int, *frames: bytes) -> None:
         """Add frames sent or received at simulated `time_us` [µs]."""
         stamp = _TIME.pack(self.start_unix_us + time_us & ~_LINK_BITS)
-        for frame in frames:
-            # MAVLink 1 has no ids above 255.
-            secret = frame[0] == 0xFD and frame[7:10] == _SETUP_SIGNING.id_bytes
-            self.add(time_us, stamp, _without_key(frame) if secret else frame)
+        # MAVLink 1 has no ids above 255.
+        public = [
+            _without_key(raw) if raw[7:10] == _SETUP_SIGNING.id_bytes and raw[0] == 0xFD else raw
+            for raw in frames
+        ]
+        self.add(time_us, *[part for raw in public for part in (stamp, raw)])
 
 
 def _without_key(frame: bytes) -> bytes:
