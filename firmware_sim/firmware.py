@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gc
+import json
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -14,6 +15,7 @@ import numpy as np
 from airl_mav.camera.frame import Frame
 from airl_mav.core import clock, constants, files
 from airl_mav.core.addons import entries, load
+from airl_mav.flight.judge import Effect
 from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim import fault_timeline, interfaces
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
@@ -121,11 +123,10 @@ class FlightStack(Protocol):
     def counters(self) -> dict[str, LinkCounters]:
         """Return traffic counters by link name."""
 
-    def strangers(self) -> Sequence[str]:
-        """Return a line for each unidentified client that commanded the vehicle in this episode.
+    def effects(self) -> Sequence[Effect]:
+        """Return the messages that took effect on the vehicle in this episode, by sender.
 
-        The heartbeat of such a client is neither a companion's nor a ground station's. Empty for
-        external firmware, whose MAVLink is not inspected here.
+        Empty for external firmware, whose MAVLink is not inspected here.
         """
 
     def close(self) -> None:
@@ -148,7 +149,7 @@ class BuiltinFlightStack:
         self.send = server.send if keeper is None else self._send_and_save
         self.log_to = server.log_to
         self.counters = server.counters
-        self.strangers = server.strangers
+        self.effects = server.effects
 
     def boot(self, setup: EpisodeSetup) -> BuiltinAutopilot:
         """Boot the autopilot of an episode. Raises UsageError for an invalid parameter."""
@@ -390,8 +391,9 @@ class Firmware:
     def save(self, path: Path) -> None:
         """Write the episode's arrays and close its logs. The flight continues without logs."""
         if self.simulation is not None:
-            strangers = np.array(self.flight_stack.strangers(), np.str_)
-            files.save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
+            lines = [json.dumps(asdict(effect)) for effect in self.flight_stack.effects()]
+            effects = np.array(lines, np.str_)
+            files.save_arrays(path, {**self.simulation.arrays(), "commands/effects": effects})
             self.close_logs()
 
     def close_logs(self) -> None:

@@ -110,8 +110,10 @@ class EpisodeRecord:
     notes: tuple[str, ...] = ()
     """Other events: failsafes, watchdog trips."""
     invalid: tuple[str, ...] = ()
-    """Reasons why the flight is no test of the policy (`flight.validity`): the host disturbed every
-    attempt. Empty: valid."""
+    """Reasons why the flight is no test of the policy (`flight.judge`): the host or another sender
+    disturbed every attempt. Empty: valid."""
+    effects: tuple[judge.Effect, ...] = ()
+    """Messages that took effect on the built-in flight controller, by sender."""
     companion_use: ProcessUse | None = None
     """Resources used by the companion process, from arming to the ground; None without a
     separate process (gym, lockstep), and in older records."""

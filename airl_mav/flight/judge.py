@@ -150,7 +150,41 @@ BY_HAND = "latency or compensation was changed by hand"
 """Invalidity reason after a manual change in flight."""
 
 STRANGER = "commanded by a stranger"
-"""Invalidity reason if another client commanded the vehicle; its name follows."""
+"""Invalidity reason if a sender other than the companion acted on the vehicle; `Effect` follows."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Messages of one sender and type that took effect on the vehicle."""
+
+    link: str
+    """Name of the link: `onboard`, `gcs`, `payload`, `gimbal`."""
+    peer: str
+    """HOST:PORT of the sender; empty for the link's preset remote."""
+    system: int
+    component: int
+    message: str
+    """MAVLink message, with its MAV_CMD, or the name of the parameter that it changed."""
+    count: int
+    first_us: int
+    """Simulated time of the first message [µs]."""
+    is_companion: bool
+    """True for the flight's own companion, the only sender that every scenario expects."""
+    old: float | None = None
+    """Value of the parameter, or size of the plan, before the first message; None: no change."""
+    new: float | None = None
+    """Value or size after the last message."""
+
+    def __str__(self) -> str:
+        """Return the effect on one line."""
+        where = f"{self.link} {self.peer}".rstrip()
+        changed = "" if self.old is None else f" from {self.old:.7g} to {self.new:.7g}"
+        times = "once" if self.count == 1 else f"{self.count} times"
+        return (
+            f"{where}, system {self.system} component {self.component}, {self.message}{changed}"
+            f" ({times}, first at {self.first_us / US_PER_S:.1f} s)"
+        )
+
 
 LATE_FRAMES = 3.0
 """Delay limit in camera periods, for a frame's age at its decision, and for a decision's start
@@ -250,8 +284,8 @@ def host_figures(
     )
 
 
-def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the reasons why a flight is invalid; `strangers` are other commanding clients."""
+def host_faults(figures: HostFigures) -> tuple[str, ...]:
+    """Return the reasons why a flight disturbed by the host is invalid."""
     faults = []
     for rule in RULES:
         value = getattr(figures, rule.figure)
@@ -259,7 +293,6 @@ def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[st
             continue
         if value < rule.limit if rule.least else value > rule.limit:
             faults.append(rule.text.format(rule.scale * value, rule.scale * rule.limit))
-    faults.extend(f"{STRANGER}: {stranger}" for stranger in strangers)
     return tuple(faults)
 
 

@@ -332,7 +332,11 @@ class LockstepFlight:
             faults=episode.faults_of(arrays),
             sha256=self._fingerprint(),
         )
-        # A flight that a viewer changed is not reproducible: its digest is removed.
+        effects = self._stage.firmware.flight_stack.effects()
+        record = episode.with_effects(record, self._resolved, effects)
+        # A flight that a viewer or another sender changed is not reproducible: without digest.
+        if record.invalid:
+            record = replace(record, sha256=None)
         if self._watched is not None and self._watched.companion.touched:
             notes = (*record.notes, BY_HAND)
             record = replace(record, notes=notes, invalid=(*record.invalid, BY_HAND), sha256=None)

@@ -20,12 +20,7 @@ from airl_mav.core.clock import Patience, SimClock
 from airl_mav.faults import LINKS, Fault
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, FlightDigest, Handle, LockstepError, Turn
-from airl_mav.lockstep.vehicle import (
-    BOOT_UNIX_US,
-    ConductedVehicle,
-    MemoryCamera,
-    builtin_vehicle,
-)
+from airl_mav.lockstep.vehicle import BOOT_UNIX_US, ConductedVehicle, MemoryCamera, builtin_vehicle
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
 from companion.mavsdk_link import MavsdkLink

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -171,12 +172,33 @@ def join_episode(
     if _slow_images(scenario):
         record = replace(record, notes=(*record.notes, *_told_of_images(latency)))
     if scenario.scenario.validity:
-        strangers = arrays["commands/strangers"].tolist()
-        record = replace(record, invalid=judge.host_faults(figures, strangers))
+        record = replace(record, invalid=judge.host_faults(figures))
+    effects = [judge.Effect(**json.loads(line)) for line in arrays["commands/effects"].tolist()]
+    record = with_effects(record, scenario, effects)
     if episode.ended is not None and episode.ended.by_hand:
         notes, invalid = (*record.notes, judge.BY_HAND), (*record.invalid, judge.BY_HAND)
         record = replace(record, notes=notes, invalid=invalid)
     return run_folder.FlownEpisode(record, trajectory, latency)
+
+
+def with_effects(
+    record: EpisodeRecord, scenario: ResolvedScenario, effects: Sequence[judge.Effect]
+) -> EpisodeRecord:
+    """Return the record with the messages that took effect on the vehicle.
+
+    An effect before the verdict makes the flight invalid, unless the companion sent the message. If
+    the scenario permits the sender, the effect is a note.
+    """
+    asked, notes, invalid = scenario.scenario, list(record.notes), list(record.invalid)
+    for effect in effects:
+        if effect.is_companion or effect.first_us >= record.ended_us:
+            continue
+        permitted = asked.ground_station and effect.link == "gcs"
+        if permitted or not asked.validity:
+            notes.append(f"commanded by {effect}")
+        else:
+            invalid.append(f"{judge.STRANGER}: {effect}")
+    return replace(record, notes=tuple(notes), invalid=tuple(invalid), effects=tuple(effects))
 
 
 def _slow_images(scenario: ResolvedScenario) -> bool:

@@ -353,6 +353,10 @@ class Flights(Workers):
         description="level sitl: fly again what the host disturbed, as it is no test of the policy;"
         " without, every flight counts, and the report says so",
     )
+    ground_station: bool = switch(
+        "level sitl: a ground station may command the vehicle and change parameters; the record"
+        " names each message, and the flight stays valid"
+    )
     slots: Annotated[int, FREE, "execution"] = quantity(
         "level gym: flights at a time; decides the pace, not the results",
         "1",

@@ -54,6 +54,8 @@ class Parameters:
         KeyError if the name is unknown."""
         self.revision = 0
         """Counter that increases with each change of a value."""
+        self.history: list[tuple[str, float, float]] = []
+        """Name, old and new value of each change; the MAVLink server takes them."""
         self._listeners: list[Callable[[], None]] = []
         self._bounded: set[str] = {name for name in overrides or () if self._is_bounded(name)}
         """Parameters whose value is clipped for flight, and reported as such."""
@@ -159,6 +161,8 @@ class Parameters:
         stored = type(spec.default)(value)
         if isinstance(stored, int) and not _INT32_LOW <= stored <= _INT32_HIGH:
             return False
+        if stored != self._values[index]:
+            self.history.append((name, self._values[index], stored))
         self._values[index] = stored
         self.revision += 1
         # Flight code reads the clipped value, clients the stored one.

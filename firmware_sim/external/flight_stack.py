@@ -167,7 +167,7 @@ class ExternalFlightStack:
         if tlog is not None:
             self._launcher.flight_log = tlog.path.with_suffix(interfaces.ULOG_SUFFIX)
 
-    def strangers(self) -> tuple[str, ...]:
+    def effects(self) -> tuple[()]:
         """Return an empty tuple: traffic on the firmware's links is not inspected."""
         return ()
 

@@ -21,18 +21,14 @@ from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink import streams
 from firmware_sim.mavlink.clients import Allowance, Client, Clients, Complaints, TickTime
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
-from firmware_sim.mavlink.endpoint import (
-    Peer,
-    Sender,
-    SharedEndpoint,
-)
+from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.link import Link, LinkCounters, Payloads
 from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, gcs_link, onboard_link
 from firmware_sim.mavlink.services import Context, connection, handle, send_pending, sender, table
 from firmware_sim.mavlink.streams.sensors import Radio
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts_and_events import REPLY_IDS, EventBuffer, EventSender, TextEncoder
-from firmware_sim.mavlink.traffic import Forwarder, Senders, TlogWriter, TrafficLog
+from firmware_sim.mavlink.traffic import READING, Effects, Forwarder, TlogWriter, TrafficLog
 
 _DISCARD_CALLS = 16
 """Number of reads that empty a link: 16 times 256 datagrams exceed a socket's buffer."""
@@ -112,8 +108,8 @@ class MavlinkServer:
         self._complaints = Complaints()
         self._first_in_turn = 0
         """Index of the first client in the next round of list and file messages."""
-        self._senders = Senders()
-        self.strangers = self._senders.strangers
+        self._effects = Effects()
+        self.effects = self._effects.effects
         # All links share these builders, so each message is built once per tick.
         self._builders: dict[str, streams.Builder | None] = {
             **streams.BUILDERS,
@@ -150,7 +146,10 @@ class MavlinkServer:
         self._forget_us = 0
         self._system_id = _system_id(port)
         self._vehicle.attach(port, truth, self._system_id)
-        self._senders.forget()
+        self._effects.forget()
+        # The values at boot are no changes by clients.
+        port.parameters.history.clear()
+        port.plans.history.clear()
         self._complaints.restart()
         self._announced.renew()
         for state in self.vehicle_states.values():
@@ -416,8 +415,8 @@ class MavlinkServer:
         self._traffic.record_first(client, message)
         kind = message.get_type()
         effective = handle(message, kind, context)
-        if effective:
-            self._senders.note(message, kind, source)
+        if effective and kind not in READING:
+            self._effects.note(message, kind, source, client, context)
         # Frames without effect here may still concern another client.
         forwarded = self._forwarder.forward(message, client, self._system_id, self._now_us)
         return effective or forwarded

@@ -1,4 +1,4 @@
-"""Traffic of all clients: tlog files, unidentified commanders, forwarding between clients.
+"""Traffic of all clients: tlog files, messages with an effect, forwarding between clients.
 
 A tlog is raw MAVLink with receive times, for MAVProxy, QGroundControl and pymavlink. A record is an
 8-byte big-endian time [µs since 1970, UTC] and one frame.
@@ -9,12 +9,14 @@ from __future__ import annotations
 import struct
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from airl_mav.core.files import LogFile
+from airl_mav.flight.judge import Effect
 from firmware_sim.mavlink.clients import Client
 from firmware_sim.mavlink.codec import COMPONENT_ID, Encoder, WireMessage, dialect, layout, trimmed
-from firmware_sim.mavlink.services import ANY, sender
+from firmware_sim.mavlink.services import ANY, Context, sender, table
 
 _TIME = struct.Struct(">Q")
 _LINK_BITS = 0b11
@@ -126,58 +128,172 @@ class TrafficLog:
         client.link.tap = write
 
 
-COMMANDS = frozenset(
+READING = frozenset(
     (
-        "COMMAND_LONG",
-        "COMMAND_INT",
-        "SET_MODE",
-        "SET_POSITION_TARGET_LOCAL_NED",
-        "SET_POSITION_TARGET_GLOBAL_INT",
-        "SET_ATTITUDE_TARGET",
-        "MANUAL_CONTROL",
-        "RC_CHANNELS_OVERRIDE",
-        "MISSION_COUNT",
-        "MISSION_CLEAR_ALL",
-        "MISSION_SET_CURRENT",
-        "PARAM_SET",
-        "SETUP_SIGNING",
+        "HEARTBEAT",
+        "PING",
+        "TIMESYNC",
+        "REQUEST_EVENT",
+        "REQUEST_DATA_STREAM",
+        "PARAM_REQUEST_LIST",
+        "PARAM_REQUEST_READ",
+        "MISSION_REQUEST_LIST",
+        "MISSION_REQUEST",
+        "MISSION_REQUEST_INT",
+        "MISSION_ACK",
+        "LOG_REQUEST_LIST",
+        "LOG_REQUEST_DATA",
+        "LOG_REQUEST_END",
+        "LOG_ERASE",
+        "LOGGING_ACK",
     )
 )
-"""Messages that change the vehicle's behaviour."""
+"""Messages that only read from the vehicle, or are always rejected. Every other handled message is
+an effect, so the messages of a new service are recorded by default."""
 
-ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
-"""MAV_TYPE values in the heartbeat of a ground station and of a companion computer."""
+_SET_RATE: int = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+
+READING_COMMANDS = frozenset(
+    (
+        _SET_RATE,
+        dialect.MAV_CMD_GET_MESSAGE_INTERVAL,
+        dialect.MAV_CMD_REQUEST_MESSAGE,
+        dialect.MAV_CMD_GET_HOME_POSITION,
+        dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+        dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION,
+        dialect.MAV_CMD_REQUEST_FLIGHT_INFORMATION,
+        dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION,
+        dialect.MAV_CMD_RUN_PREARM_CHECKS,
+        dialect.MAV_CMD_LOGGING_START,
+        dialect.MAV_CMD_LOGGING_STOP,
+    )
+)
+"""MAV_CMD of the commands that only read from the vehicle."""
+
+READING_FILES = frozenset((0, 1, 2, 3, 4, 5, 14, 15))
+"""Opcodes of MAVLink FTP that only read: none, terminate and reset sessions, list, open for
+reading, read, checksum, burst."""
+
+_FTP_OPCODE = 3
+"""Index of the opcode in the payload of FILE_TRANSFER_PROTOCOL."""
+
+MAX_EFFECTS = 2_000
+"""Maximum number of recorded effects, more than the vehicle has parameters. Further effects share
+one row, so that invented system ids cannot fill the memory."""
+
+_Key = tuple["Client | None", tuple[int, int], str, "int | str"]
+"""Client, system and component id, message, MAV_CMD or name of the changed value."""
+
+_OTHERS: _Key = None, (ANY, ANY), "further messages", ""
 
 
-class Senders:
-    """Record of the systems that send commands and of those announced by a heartbeat."""
+@dataclass(slots=True)
+class _Row:
+    """Messages of one sender and type."""
+
+    first_us: int
+    is_companion: bool
+    old: float | None
+    new: float | None = None
+    count: int = 0
+
+
+_MAVSDK = 1, int(dialect.MAV_COMP_ID_PATHPLANNER)
+"""Default system and component id of MAVSDK as a companion computer."""
+
+
+class Effects:
+    """Record of the messages that took effect on the vehicle, by sender and message."""
 
     def __init__(self) -> None:
-        self._announced: set[tuple[int, int]] = set()
-        """Announced system and component ids, kept while the links are open."""
-        self._commands: Counter[tuple[int, int, str]] = Counter()
+        self._rows: dict[_Key, _Row] = {}
 
-    def note(self, message: WireMessage, kind: str, source: tuple[int, int]) -> None:
-        """Count a message from a sender if the message had an effect on this vehicle."""
-        if kind in COMMANDS:
-            self._commands[(*source, kind)] += 1
-        elif kind == "HEARTBEAT" and message.type in ANNOUNCED:
-            self._announced.add(source)
+    def note(
+        self,
+        message: WireMessage,
+        kind: str,
+        source: tuple[int, int],
+        client: Client,
+        context: Context,
+    ) -> None:
+        """Count a message that a service has handled, unless it only reads; see `READING`."""
+        detail: int | str = ""
+        if kind in ("COMMAND_LONG", "COMMAND_INT"):
+            detail = message.command
+            if detail not in table("ACTIONS"):
+                return
+            # A rate set by another system on the companion's link changes the companion's input.
+            if detail in READING_COMMANDS and (
+                detail != _SET_RATE
+                or not _is_onboard(client)
+                or _is_companion(client, source, context)
+            ):
+                return
+        elif kind == "FILE_TRANSFER_PROTOCOL" and message.payload[_FTP_OPCODE] in READING_FILES:
+            return
+        stores = context.port.parameters, context.port.plans
+        changed = stores[0].history or stores[1].history
+        row = self._rows.get((client, source, kind, detail))
+        # The usual case first: the companion repeats its setpoints.
+        if row is not None and not changed:
+            row.count += 1
+            return
+        # A PARAM_SET of the present value has no effect.
+        if kind != "PARAM_SET":
+            self._count((client, source, kind, detail), context)
+        for store in stores:
+            for name, old, new in store.history:
+                self._count((client, source, kind, name), context, old, new)
+            store.history.clear()
 
-    def strangers(self) -> tuple[str, ...]:
-        """Return a line per unannounced sender and message type since the last `forget`.
+    def _count(
+        self, key: _Key, context: Context, old: float | None = None, new: float | None = None
+    ) -> None:
+        if key not in self._rows and len(self._rows) >= MAX_EFFECTS:
+            key, old, new = _OTHERS, None, None
+        row = self._rows.get(key)
+        if row is None:
+            client, source, _, _ = key
+            invited = client is not None and _is_companion(client, source, context)
+            row = self._rows[key] = _Row(context.now_us, invited, old)
+        # The first old value and the newest value are the change in total.
+        row.new = new
+        row.count += 1
 
-        A heartbeat after a command also announces its sender: MAVSDK starts with commands.
-        """
+    def effects(self) -> tuple[Effect, ...]:
+        """Return the effects since the last `forget`, in order of their first message."""
         return tuple(
-            f"system {system} component {component}, {kind} ({count} times)"
-            for (system, component, kind), count in sorted(self._commands.items())
-            if (system, component) not in self._announced
+            Effect(
+                link="others" if client is None else client.link.name,
+                peer="" if client is None or client.peer is None else "{}:{}".format(*client.peer),
+                system=source[0],
+                component=source[1],
+                message=_title(kind, detail),
+                **asdict(row),
+            )
+            for (client, source, kind, detail), row in self._rows.items()
         )
 
     def forget(self) -> None:
-        """Reset the counts for a new episode."""
-        self._commands.clear()
+        """Reset the record for a new episode."""
+        self._rows.clear()
+
+
+def _is_onboard(client: Client) -> bool:
+    """Return True for the preset remote of the onboard link, where the companion listens."""
+    return client.peer is None and client.link.name == "onboard"
+
+
+def _is_companion(client: Client, source: tuple[int, int], context: Context) -> bool:
+    # By convention a companion has the system id of its vehicle.
+    mavsdk = _MAVSDK, (context.system_id, _MAVSDK[1])
+    return source in mavsdk and _is_onboard(client)
+
+
+def _title(kind: str, detail: int | str) -> str:
+    if isinstance(detail, int):
+        detail = dialect.enums["MAV_CMD"][detail].name
+    return f"{kind} {detail}".rstrip()
 
 
 REMEMBERED_FRAMES = 128

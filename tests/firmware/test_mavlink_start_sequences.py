@@ -166,6 +166,7 @@ def test_qgroundcontrol_connects(lost_every: int) -> None:
     # Its pages also query devices that do not exist: refused, not ignored.
     for number in (259, 280):  # CAMERA_INFORMATION, GIMBAL_MANAGER_INFORMATION
         assert station.command(512, number) != dialect.MAV_RESULT_ACCEPTED
+    assert station.rig.bench.server.effects() == ()
 
 
 def test_mavros_connects() -> None:

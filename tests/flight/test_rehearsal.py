@@ -6,10 +6,11 @@ Both processes have stand-ins, so that events arrive in a test's exact order. `t
 
 from __future__ import annotations
 
+import json
 import queue
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import pytest
 from airl_mav.core.child_process import Exited
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.episode_record import EpisodeRecord
+from airl_mav.flight.judge import Effect
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.rehearsal import process_pair, rehearsal
 from airl_mav.rehearsal.channel import (
@@ -99,7 +101,7 @@ class Stage:
         self.on_abort: Callable[[Abort], list[Item]] = lambda _: [ended("stopped")]
         self.saves = True
         self.slips: list[tuple[int, int]] = []
-        self.strangers: list[str] = []
+        self.effects: list[Effect] = []
         self.faults: list[tuple[str, int, int]] = []
         """Faults that acted, each with begin and end [µs]."""
         self.goes_on: list[Item] = []
@@ -177,7 +179,7 @@ class FakeChild:
 
     def save(self) -> None:
         stage = self.stage
-        write_record(self.record, stage.slips, stage.strangers, stage.faults)
+        write_record(self.record, stage.slips, stage.effects, stage.faults)
 
     def suspend(self) -> None:
         self.standing.append(True)
@@ -200,7 +202,7 @@ class FakeChild:
 def write_record(
     path: Path,
     slips: Sequence[tuple[int, int]],
-    strangers: Sequence[str],
+    effects: Sequence[Effect],
     faults: Sequence[tuple[str, int, int]],
 ) -> None:
     """Write the firmware's files of an episode: 100 s at 10 m/s to the north."""
@@ -220,7 +222,7 @@ def write_record(
         "estimate/time_us": np.zeros(0, np.int64),
         "tick/lateness_us": np.zeros(3, np.int64),
         "tick/slips_us": np.array(slips, np.int64).reshape(-1, 2),
-        "commands/strangers": np.array(strangers, np.str_),
+        "commands/effects": np.array([json.dumps(asdict(e)) for e in effects], np.str_),
     }
     acted = [Acted(*each) for each in faults]
     arrays |= fault_arrays(acted)
@@ -440,16 +442,53 @@ def test_what_stays_invalid_is_kept_with_its_reasons(play: Callable[..., Run]) -
     assert [episode.invalid for episode in held] == [(FAULT,), ()]
 
 
-def test_a_stranger_who_commands_makes_a_flight_invalid(
-    play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+IN_FLIGHT_US = START_US + 3_000_000
+
+
+def changed(**fields: Any) -> Effect:
+    """Return the effect of a ground station that sets a parameter in flight."""
+    usual = Effect(
+        *("gcs", "", 255, 190, "PARAM_SET MPC_XY_VEL_MAX", 1, IN_FLIGHT_US, False, 12.0, 3.0)
+    )
+    return replace(usual, **fields)
+
+
+CHANGED = (
+    "gcs, system 255 component 190, PARAM_SET MPC_XY_VEL_MAX from 12 to 3 (once, first at 4.0 s)"
+)
+
+
+@pytest.mark.parametrize(
+    ("effect", "options", "invalid", "notes"),
+    [
+        (changed(), {}, (f"commanded by a stranger: {CHANGED}",), ()),
+        (changed(), {"ground_station": True}, (), (f"commanded by {CHANGED}",)),
+        (changed(), {"validity": False}, (), (f"commanded by {CHANGED}",)),
+        (
+            changed(link="onboard"),
+            {"ground_station": True},
+            (f"commanded by a stranger: {CHANGED.replace('gcs', 'onboard')}",),
+            (),
+        ),
+        (changed(is_companion=True), {}, (), ()),
+        (changed(first_us=START_US + 90_000_000), {}, (), ()),
+    ],
+    ids=["unasked", "permitted", "unchecked", "another link", "companion", "after the verdict"],
+)
+def test_an_effect_of_another_sender_makes_a_flight_invalid(
+    play: Callable[..., Run],
+    monkeypatch: pytest.MonkeyPatch,
+    effect: Effect,
+    options: dict[str, Any],
+    invalid: tuple[str, ...],
+    notes: tuple[str, ...],
 ) -> None:
     monkeypatch.setattr(rehearsal, "MAX_ATTEMPTS", 1)
     run = play(FLOWN)
-    run.stage.strangers = ["system 7 component 1, COMMAND_LONG (3 times)"]
-    (record,) = run.fly()
-    assert record.invalid == (
-        "commanded by a stranger: system 7 component 1, COMMAND_LONG (3 times)",
-    )
+    run.stage.effects = [effect]
+    (record,) = run.fly(episodes=1, **options)
+    assert (record.invalid, record.notes) == (invalid, notes)
+    assert load(run.folder.path).episodes[0].effects == record.effects == (effect,)
 
 
 def test_a_run_with_invalid_flights_goes_on_with_them(

@@ -119,6 +119,7 @@ class Parameters:
 
     def __init__(self, values: dict[str, int | float] | None = None) -> None:
         self.values = dict(sorted((DEFAULT_PARAMETERS if values is None else values).items()))
+        self.history: list[tuple[str, float, float]] = []
 
     @property
     def value(self) -> Callable[[str], float]:
@@ -149,7 +150,9 @@ class Parameters:
     def set(self, name: str, value: int | float) -> ParameterValue | None:
         if name not in self.values:
             return None
-        self.values[name] = type(self.values[name])(value)
+        before, self.values[name] = self.values[name], type(self.values[name])(value)
+        if self.values[name] != before:
+            self.history.append((name, before, self.values[name]))
         return self.by_name(name)
 
     def reset(self) -> None:

@@ -109,9 +109,3 @@ def test_stamps_that_never_came_are_no_intervals() -> None:
     got = figures(decisions={"capture_us": never, "infer_start_us": infer, "held_until_us": never})
     assert (got.stale_frames, got.late_decisions) == (None, None)
     assert host_faults(figures(decisions={}, lateness_us=np.zeros(0), wall_s=None)) == ()
-
-
-def test_a_stranger_who_commands_is_named() -> None:
-    assert host_faults(GOOD, ["system 7 component 1, COMMAND_LONG"]) == (
-        "commanded by a stranger: system 7 component 1, COMMAND_LONG",
-    )

@@ -90,6 +90,8 @@ class Plans:
         """Number of client selections of the current item."""
         self.changes = 0
         """Number of stored lists and client selections."""
+        self.history: list[tuple[str, float, float]] = []
+        """Name, old and new number of items of each stored list; the MAVLink server takes them."""
         self.reached = -1
         """Index of the newest reached item; -1 = none in this run."""
         self.jumps_done: dict[int, int] = {}
@@ -121,6 +123,8 @@ class Plans:
         `current` is the first mission item; -1 = the current index, at most the last item.
         """
         self.changes += 1
+        before = len(self._stored[kind].items)
+        self.history.append((f"items of {kind.name.lower()}", before, len(items)))
         self._stored[kind] = Stored(items, identity, self._stored[kind].revision + 1)
         if kind is MissionType.MISSION:
             self.current = current if current >= 0 else min(self.current, max(0, len(items) - 1))
