@@ -175,14 +175,15 @@ class Effect:
     new: float | None = None
     """Value or size after the last message."""
 
-    def __str__(self) -> str:
-        """Return the effect on one line."""
+    def line(self, started_us: int) -> str:
+        """Return the effect on one line, with its time after the reset at `started_us` [µs]."""
         where = f"{self.link} {self.peer}".rstrip()
         changed = "" if self.old is None else f" from {self.old:.7g} to {self.new:.7g}"
         times = "once" if self.count == 1 else f"{self.count} times"
+        after_s = (self.first_us - started_us) / US_PER_S
         return (
             f"{where}, system {self.system} component {self.component}, {self.message}{changed}"
-            f" ({times}, first at {self.first_us / US_PER_S:.1f} s)"
+            f" ({times}, first {after_s:.1f} s after the reset)"
         )
 
 

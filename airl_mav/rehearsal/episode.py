@@ -195,9 +195,9 @@ def with_effects(
             continue
         permitted = asked.ground_station and effect.link == "gcs"
         if permitted or not asked.validity:
-            notes.append(f"commanded by {effect}")
+            notes.append(f"commanded by {effect.line(record.started_us)}")
         else:
-            invalid.append(f"{judge.STRANGER}: {effect}")
+            invalid.append(f"{judge.STRANGER}: {effect.line(record.started_us)}")
     return replace(record, notes=tuple(notes), invalid=tuple(invalid), effects=tuple(effects))
 
 

@@ -101,8 +101,9 @@ def test_a_changed_parameter_is_recorded_with_old_and_new_value(field: Field) ->
     field.run(0.1)
     (effect,) = field.server.effects()
     assert (effect.message, effect.old, effect.new) == ("PARAM_SET MPC_XY_VEL_MAX", 12.0, 2.5)
-    assert str(effect).startswith(
-        "gcs, system 255 component 190, PARAM_SET MPC_XY_VEL_MAX from 12 to 2.5 (2 times, first at "
+    assert effect.line(effect.first_us) == (
+        "gcs, system 255 component 190, PARAM_SET MPC_XY_VEL_MAX from 12 to 2.5"
+        " (2 times, first 0.0 s after the reset)"
     )
 
 
@@ -179,6 +180,6 @@ def test_a_new_episode_begins_without_effects(field: Field) -> None:
 
 def test_an_effect_on_one_line() -> None:
     effect = Effect("onboard", "10.0.0.7:5000", 77, 1, "ODOMETRY", 1, 12_340_000, False)
-    assert str(effect) == (
-        "onboard 10.0.0.7:5000, system 77 component 1, ODOMETRY (once, first at 12.3 s)"
+    assert effect.line(10_000_000) == (
+        "onboard 10.0.0.7:5000, system 77 component 1, ODOMETRY (once, first 2.3 s after the reset)"
     )

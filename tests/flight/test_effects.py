@@ -62,7 +62,7 @@ def test_a_foreign_system_makes_the_flight_invalid_by_every_message() -> None:
         named = f"commanded by a stranger: onboard, system 77 component 1, {name}"
         assert any(line.startswith(named) for line in record.invalid), name
     limited = next(line for line in record.invalid if "MPC_XY_VEL_MAX" in line)
-    assert " from 12 to 6.5 (once, first at " in limited
+    assert " from 12 to 6.5 (once, first " in limited
     assert record.sha256 is None
     assert all(record.started_us <= effect.first_us for effect in record.effects)
 

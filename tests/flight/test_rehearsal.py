@@ -454,7 +454,8 @@ def changed(**fields: Any) -> Effect:
 
 
 CHANGED = (
-    "gcs, system 255 component 190, PARAM_SET MPC_XY_VEL_MAX from 12 to 3 (once, first at 4.0 s)"
+    "gcs, system 255 component 190, PARAM_SET MPC_XY_VEL_MAX from 12 to 3"
+    " (once, first 3.0 s after the reset)"
 )
 
 

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import socket
+import threading
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +22,11 @@ from pymavlink import mavutil
 from airl_mav.latency.injection import build_sampler
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import load_computer
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from tests.support.command_line import airl
+from tests.support.foreign_messages import CHANGED, FOREIGN
+from tests.support.mavlink_clients import RawClient
 from tests.support.ports import choose_ports
 from tests.support.processes import SITL, SITL_WITHOUT_REPORT, running, write_arena
 
@@ -308,6 +317,51 @@ def test_injected_latency(tmp_path: Path) -> None:
     assert injection["latency"]["mean_ms"] == 396.0
     assert "396 ± 19.8 ms of injected latency" in run.output
     assert "as if Raspberry Pi 4" in (run.folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.nightly
+def test_other_senders_are_named(tmp_path: Path) -> None:
+    """A ground station sets parameters; system 77 sends poses to the companion's link."""
+    ports = choose_ports()
+    words = [*SITL_WITHOUT_REPORT, *ports.options(), "--episodes", "1", "--arena", "no-obstacles"]
+    words += ["--policy", "greedy", "--out", str(tmp_path / "run")]
+    beat = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    with (
+        running(words, tmp_path) as process,
+        sending(ports.gcs_local, (255, 190), [beat, *CHANGED.values()]),
+        sending(ports.api_local, (77, 1), [*FOREIGN["ODOMETRY"], beat]),
+    ):
+        # Without validity checks, other senders are notes.
+        assert process.wait(250.0) == 0, process.text()
+    (line,) = (tmp_path / "run" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+    episode = json.loads(line)
+    said = "\n".join(episode["notes"])
+    for name in CHANGED:
+        assert f"system 255 component 190, {name} from " in said
+    assert re.search(
+        r"commanded by onboard 127.0.0.1:\d+, system 77 component 1, ODOMETRY \(\d+ times", said
+    )
+    assert {e["component"] for e in episode["effects"] if e["is_companion"]} == {195}
+
+
+@contextmanager
+def sending(port: int, ids: tuple[int, int], messages: Sequence[Any]) -> Iterator[None]:
+    """Send messages to a port of the vehicle, ten times a second, from a thread."""
+    client, done = RawClient(MemoryEndpoint(), ids), threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+            while not done.wait(0.1):
+                for message in messages:
+                    wire.sendto(client.pack(message), ("127.0.0.1", port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 @pytest.mark.nightly

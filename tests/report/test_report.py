@@ -16,10 +16,11 @@ from rich.console import Console
 
 from airl_mav.addons.forensics.worst import examine_worst
 from airl_mav.arena.geometry import Arena
-from airl_mav.flight.judge import Outcome
+from airl_mav.flight.judge import Effect, Outcome
 from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.episode import with_effects
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
 from airl_mav.report.document import TableView
 from airl_mav.report.energy_section import energy_flights_table, energy_table, flight_energies
@@ -35,8 +36,11 @@ from airl_mav.report.run_tables import (
     real_time_table,
     run_ages,
 )
+from airl_mav.report.run_verdict import verdict_of
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
 from tests.support.page_alone import page_alone, unpacked
 from tests.support.run_demo import OUTCOMES_SEEN, demo_setup, write_demo_run
 
@@ -428,6 +432,27 @@ def test_a_lockstep_run_and_an_aborted_flight(
     assert "not paced" in text
     assert "aborted" in text
     assert "nothing injected" in text
+
+
+def test_the_page_names_who_made_a_flight_invalid(
+    demo: tuple[LoadedRun, dict[int, Arena]], tmp_path: Path
+) -> None:
+    run, _ = demo
+    first = run.episodes[0]
+    sender = ("gcs", "", 255, 190)
+    effects = [
+        Effect(*sender, "PARAM_SET MPC_XY_VEL_MAX", 2, first.ended_us - 1, False, 12.0, 3.0),
+        Effect("onboard", "127.0.0.1:5", 77, 1, "ODOMETRY", 40, first.started_us, False),
+    ]
+    record = with_effects(first, resolve(Scenario(policy="greedy")), effects)
+    bare = replace(run, episodes=(record,), trajectories={}, latency={})
+    html = build_page(bare, {}, tmp_path, verdict=verdict_of(bare)).read_text(encoding="utf-8")
+    text = " ".join(Page(html).words)
+    assert "gcs, system 255 component 190, PARAM_SET MPC_XY_VEL_MAX from 12 to 3 (2 times," in text
+    assert (
+        "onboard 127.0.0.1:5, system 77 component 1, ODOMETRY (40 times, first 0.0 s after the"
+        in text
+    )
 
 
 def test_a_run_without_flights_still_has_a_page(tmp_path: Path) -> None:
