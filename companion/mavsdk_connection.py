@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import re
-import select
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,14 @@ from mavsdk.logging import log_subscribe
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.signing import StoredSigning, frames_of
+from airl_mav.core.signing import SIGNATURE_BYTES, StoredSigning, frames_of
 from companion.link_interface import LinkError
 
 SLICE_S = 0.5
 """Maximum single wait for a flight controller [wall s]."""
+
+SEARCH_S = 0.05
+"""Interval of searches for a system id [wall s]."""
 
 RAW_URL = "raw://"
 """Connection without sockets: bytes are exchanged with this process, see `exchange_raw`."""
@@ -33,7 +35,7 @@ RAW_CHUNK = 65_536
 """Maximum bytes per call; MAVSDK's parser reassembles divided frames."""
 
 RAW_TIMEOUT_S = 3600.0
-"""MAVSDK's command timeout on a raw connection [wall s]. A reply is certain, but not its wall time:
+"""MAVSDK's command timeout in lockstep [wall s]. A reply is certain, but not its wall time:
 a process that was stopped must not repeat commands when it resumes."""
 
 
@@ -62,17 +64,37 @@ def open_connection(url: str, kind: ComponentType, system_id: int | None = None)
     raise UsageError(f"--connect {url}: {problem}")
 
 
-def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | None = None) -> Any:
-    """Return the first flight controller or None after a timeout [wall s]; LinkError on `stop`."""
+def find_autopilot(
+    mavsdk: Mavsdk,
+    timeout_s: float,
+    stop: threading.Event | None = None,
+    system_id: int | None = None,
+) -> Any:
+    """Return the flight controller with a system id or None after a timeout [wall s].
+
+    `system_id` None = the first flight controller. Raises LinkError on `stop`.
+    """
     stopwatch = WallClock()
     while (left_s := timeout_s - stopwatch.time_us() / US_PER_S) > 0.0:
         if stop is not None and stop.is_set():
             raise LinkError("stopped")
         # Short waits: Python handles signals only between calls into MAVSDK.
-        system = mavsdk.first_autopilot(min(left_s, SLICE_S))
+        if system_id is None:
+            system = mavsdk.first_autopilot(min(left_s, SLICE_S))
+        elif (system := autopilots(mavsdk).get(system_id)) is None:
+            WallClock().sleep_until(int(min(left_s, SEARCH_S) * US_PER_S))
         if system is not None:
             return system
     return None
+
+
+def autopilots(mavsdk: Mavsdk) -> dict[int, Any]:
+    """Return the connected flight controllers by system id."""
+    return {
+        system.get_system_id(): system
+        for system in mavsdk.get_systems()
+        if system.has_autopilot() and system.is_connected()
+    }
 
 
 def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
@@ -81,7 +103,6 @@ def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[byt
     `sent` receives every outgoing frame, in MAVSDK's thread: it must not block or acquire a lock
     that a feeding thread may hold. Feed from one thread at a time.
     """
-    set_timeout(mavsdk, RAW_TIMEOUT_S)
     mavsdk.subscribe_raw_bytes_to_be_sent(sent)
     # MAVSDK-Python's function creates a ctypes array type for every length of `data`: 0.1 ms.
     # One buffer, allocated once, avoids that.
@@ -172,105 +193,106 @@ def dialect_of(autopilot: Autopilot) -> Dialect:
 LINK_ID = 2
 """Link id in signatures of a companion; the flight controller's links are 0 and 1."""
 
+AUTOPILOT_COMPONENT = 1
+"""MAV_COMP_ID_AUTOPILOT1."""
+
 MAX_DATAGRAM = 4096
+RECEIVE_BUFFER_BYTES = 1 << 20
+"""Receive buffer [bytes], or the maximum that Linux allows: a flood must not displace telemetry."""
+
 POLL_S = 0.5
 """Maximum wait between checks for the end [wall s]."""
 
 _URL = re.compile(r"udp(?:in)?://(?P<host>[^:/]*):(?P<port>\d+)")
 
 
-@contextmanager
-def signed(url: str, key: Path | None) -> Iterator[str]:
-    """Yield the URL for MAVSDK: the original URL, or a proxy's URL that signs with a key."""
-    if key is None:
-        yield url
-        return
-    with closing(SigningProxy(url, key)) as proxy:
-        try:
-            yield proxy.url
-        except LinkError as error:
-            # Error messages name the URL that the user has given.
-            told = str(error).replace(proxy.url, url)
-            refused = proxy.refused
-            hint = f" ({refused} frames refused: bad signature)" if refused else ""
-            raise LinkError(told + hint) from None
-
-
 class SigningProxy:
-    """Proxy that passes verified frames to MAVSDK, and MAVSDK's frames, signed, to the vehicle."""
+    """UDP socket that passes verified frames to MAVSDK, and MAVSDK's frames, signed, to vehicles.
 
-    def __init__(self, url: str, key: Path) -> None:
-        """Bind and start the proxy of udpin://HOST:PORT; the default host is this machine."""
+    MAVSDK exchanges raw bytes with this process, so no other program can reach it. MAVSDK accepts
+    every frame; an unsigned HEARTBEAT could report another mode or an invented vehicle.
+    """
+
+    def __init__(self, url: str, key: Path, system_id: int | None = None) -> None:
+        """Bind udpin://HOST:PORT; the default host is this machine.
+
+        `system_id` is the system id of the vehicle to send to; None = every vehicle with the key.
+        """
         # Signing works on datagrams, so serial connections are not supported.
         found = _URL.fullmatch(url)
         if found is None:
             raise UsageError(f"--connect {url}: with a signing key: udpin://HOST:PORT")
         self._stored = StoredSigning(key)
-        self._vehicle: tuple[str, int] | None = None
-        self._outer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._inner = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._system_id = system_id
+        self._vehicles: dict[int, tuple[str, int]] = {}
+        """Newest address of each vehicle, by system id."""
+        self._links: dict[bytes, int] = {}
+        """Link id of each sender, by its system and component id."""
+        self._lock = threading.Lock()
+        """Held to sign or verify: both threads use the time stamps."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         try:
-            # Outer socket: the vehicle's port. Inner socket: a free port towards MAVSDK.
-            self._outer.bind((found["host"] or LOOPBACK, int(found["port"])))
-            self._inner.bind((LOOPBACK, 0))
-            # A free port for MAVSDK to listen on; MAVSDK replies to the sender.
-            # The probe closes at once; MAVSDK binds the port a moment later.
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                probe.bind((LOOPBACK, 0))
-                self._mavsdk: tuple[str, int] = probe.getsockname()
+            self._socket.bind((found["host"] or LOOPBACK, int(found["port"])))
         except OSError as error:
-            self._outer.close()
-            self._inner.close()
+            self._socket.close()
             raise UsageError(f"--connect {url}: {error.strerror}") from None
-        self.url = f"udpin://{LOOPBACK}:{self._mavsdk[1]}"
-        """URL for MAVSDK."""
+        self._socket.settimeout(POLL_S)
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="signing", daemon=True)
-        self._thread.start()
+        self._thread: threading.Thread | None = None
 
     @property
     def refused(self) -> int:
-        """Number of frames rejected for an invalid signature or as duplicates."""
+        """Number of frames rejected: unsigned, with an invalid signature, or duplicates."""
         return self._stored.signing.refused
 
+    def start(self, mavsdk: Mavsdk) -> None:
+        """Start the exchange with a MAVSDK connected to `RAW_URL`; close before MAVSDK."""
+        feed = exchange_raw(mavsdk, self._send)
+        self._thread = threading.Thread(target=self._run, args=(feed,), name="signing", daemon=True)
+        self._thread.start()
+
     def close(self) -> None:
-        """Stop the proxy and store the newest time stamp. Idempotent."""
+        """Stop the exchange and store the newest time stamp. Idempotent."""
         # The stamp is stored last: a reused time stamp would be rejected after a restart.
         if not self._stop.is_set():
             self._stop.set()
-            self._thread.join()
-            self._outer.close()
-            self._inner.close()
+            if self._thread is not None:
+                self._thread.join()
+            self._socket.close()
             self._stored.save()
 
-    def _run(self) -> None:
+    def _run(self, feed: Callable[[bytes], None]) -> None:
         while not self._stop.is_set():
-            # A finite timeout lets the loop see `_stop`.
-            ready, _, _ = select.select((self._outer, self._inner), (), (), POLL_S)
-            for end in ready:
-                try:
-                    data, address = end.recvfrom(MAX_DATAGRAM)
-                    if end is self._outer:
-                        self._from_vehicle(data, address)
-                    elif address == self._mavsdk:
-                        # Frames of other programs on this machine must not be signed.
-                        self._from_mavsdk(data)
-                except OSError:
-                    continue  # no listener yet
+            # The finite timeout lets the loop see `_stop`; other errors are ICMP messages.
+            with suppress(OSError):
+                data, address = self._socket.recvfrom(MAX_DATAGRAM)
+                with self._lock:
+                    accepted = [each for each in frames_of(data) if self._accepts(each, address)]
+                if accepted:
+                    feed(b"".join(accepted))
             self._stored.save_due()
 
-    def _from_vehicle(self, data: bytes, address: tuple[str, int]) -> None:
-        accepted = [frame for frame in frames_of(data) if self._stored.signing.accepts(frame)]
-        # Byte 2 holds the incompatibility flags; bit 0 marks a signed frame.
-        if any(frame[2] & 1 for frame in accepted):
-            self._vehicle = address  # an unsigned heartbeat does not set the address
-        if accepted:
-            # Frames are forwarded together: in lockstep, a second of telemetry arrives at once and
-            # would overflow MAVSDK's socket as single frames.
-            self._inner.sendto(b"".join(accepted), self._mavsdk)
+    def _accepts(self, frame: bytes, address: tuple[str, int]) -> bool:
+        """Return True for a signed frame of its sender's link; store the address of a vehicle."""
+        signing, source, link = self._stored.signing, frame[5:7], frame[-SIGNATURE_BYTES]
+        # Frames of a vehicle's other link are signed and new here, but may be old: only one counts.
+        if self._links.get(source, link) != link:
+            signing.refused += 1
+            return False
+        if not signing.accepts(frame, unsigned=False):
+            return False
+        self._links[source] = link
+        system, component = source
+        if component == AUTOPILOT_COMPONENT and self._system_id in (None, system):
+            self._vehicles[system] = address
+        return True
 
-    def _from_mavsdk(self, data: bytes) -> None:
-        if self._vehicle is None:
-            return
-        for frame in frames_of(data):
-            self._outer.sendto(self._stored.signing.sign(frame, LINK_ID), self._vehicle)
+    def _send(self, frame: bytes) -> None:
+        with self._lock:
+            vehicles = set(self._vehicles.values())
+            signed = self._stored.signing.sign(frame, LINK_ID) if vehicles else b""
+        for address in vehicles:
+            # MAVSDK may still send while the socket closes.
+            with suppress(OSError):
+                self._socket.sendto(signed, address)

@@ -7,6 +7,7 @@ import math
 import struct
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,17 +19,21 @@ from mavsdk.plugins.offboard import AttitudeRate, Offboard, OffboardError, Veloc
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
-from airl_mav.core import constants
+from airl_mav.core import constants, errors
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.policy import actions, observation
 from companion import link_interface
 from companion.mavsdk_connection import (
     POSITION,
     PX4,
+    RAW_TIMEOUT_S,
+    RAW_URL,
     Dialect,
+    SigningProxy,
+    autopilots,
     dialect_of,
     exchange_raw,
-    first_autopilot,
+    find_autopilot,
     open_connection,
     set_timeout,
 )
@@ -84,13 +89,17 @@ class MavsdkLink:
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
         poll: Callable[[int, link_interface.Due, link_interface.Quiet], None] | None = None,
+        *,
+        signing_key: Path | None = None,
+        system_id: int | None = None,
     ) -> None:
         """Open a connection, see `open_connection`; `connect` waits for the vehicle.
 
         `abandon`, set from another thread, ends any wait. `heard` returns True if the flight
         controller is received, independent of wall time; None = MAVSDK decides. `poll` sleeps for
         an interval [µs], and repeats while a condition need not be checked; None = check after
-        every interval.
+        every interval. `signing_key` is the key file that signs frames; None = unsigned.
+        `system_id` is the system id of the vehicle; None = the first flight controller.
         """
         self.url = url
         self._clock = clock
@@ -99,7 +108,18 @@ class MavsdkLink:
         self._heard = heard
         self.setpoints_sent = 0
         """Number of setpoints passed to MAVSDK, without MAVSDK's repetitions."""
-        self._mavsdk = open_connection(url, ComponentType.COMPANION_COMPUTER)
+        self._system_id = system_id
+        self._proxy: SigningProxy | None = None
+        if signing_key is not None:
+            self._proxy, url = SigningProxy(url, signing_key, system_id), RAW_URL
+        try:
+            self._mavsdk = open_connection(url, ComponentType.COMPANION_COMPUTER, system_id)
+        except errors.UsageError:
+            self._close_proxy()
+            raise
+        if self._proxy is not None:
+            self._proxy.start(self._mavsdk)
+        self._met = WallClock()
         self._system: Any = None
         self._telemetry: Any = None
         self._action: Any = None
@@ -113,9 +133,10 @@ class MavsdkLink:
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
-        system = first_autopilot(self._mavsdk, timeout_s, stop)
+        system = find_autopilot(self._mavsdk, timeout_s, stop, self._system_id)
         if system is None:
             raise self._unheard(timeout_s)
+        self._met = WallClock()
         # A second `connect` replaces the plugins of an earlier system.
         self._release_plugins()
         self._system = system
@@ -124,6 +145,20 @@ class MavsdkLink:
         self._offboard = Offboard(system)
         self._ask_for_streams(stop)
         self._asked = True
+
+    def check_alone(self, listen_s: float = 0.0) -> None:
+        """Raise LinkError if several flight controllers are heard and no system id selects one.
+
+        `listen_s` is the minimum time since `connect` [wall s]. In lockstep there is one vehicle.
+        """
+        if self._system_id is not None or self._heard is not None:
+            return
+        self._met.sleep_until(int(listen_s * constants.US_PER_S), self._abandon)
+        if len(found := sorted(autopilots(self._mavsdk))) > 1:
+            raise link_interface.LinkError(
+                f"several flight controllers are heard on {self.url}: systems"
+                f" {', '.join(map(str, found))}; choose one with airl-companion --system-id"
+            )
 
     def prepare(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Prepare a connection that may have been used by earlier missions.
@@ -164,9 +199,10 @@ class MavsdkLink:
                 self._pause_wall(stop)
 
     def _unheard(self, timeout_s: float) -> link_interface.LinkError:
-        return link_interface.LinkError(
-            f"no flight controller heard on {self.url} in {timeout_s:g} s"
-        )
+        who = "flight controller" if self._system_id is None else f"system {self._system_id}"
+        refused = 0 if self._proxy is None else self._proxy.refused
+        hint = f" ({refused} frames refused: bad signature)" if refused else ""
+        return link_interface.LinkError(f"no {who} heard on {self.url} in {timeout_s:g} s{hint}")
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
         if self._abandon.is_set() or (stop is not None and stop.is_set()):
@@ -175,6 +211,7 @@ class MavsdkLink:
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
         """Exchange the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
+        self.set_timeout(RAW_TIMEOUT_S)
         return exchange_raw(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
@@ -198,7 +235,12 @@ class MavsdkLink:
     def close(self) -> None:
         """Release MAVSDK."""
         self._release_plugins()
+        self._close_proxy()  # ends the feed before MAVSDK
         self._mavsdk.destroy()
+
+    def _close_proxy(self) -> None:
+        if self._proxy is not None:
+            self._proxy.close()
 
     def _release_plugins(self) -> None:
         own = self._direct, self._texts, self._offboard, self._action, self._telemetry
@@ -297,6 +339,7 @@ class MavsdkLink:
                 tell_us = self._tell_origin(origin, tell_us)
             if missing:
                 good_since_us = self._clock.time_us()
+        self.check_alone()
         while True:
             try:
                 self._action.arm()
@@ -373,6 +416,7 @@ class MavsdkLink:
             self._check(None, stop=stop)
             self.send_setpoint(link_interface.STOP)
             self._pause(OFFBOARD_REPEAT_S)
+        self.check_alone()
 
     def _flies_offboard(self) -> bool:
         status = self.status()

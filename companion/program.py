@@ -27,7 +27,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import checks, model, stand_alone
 from companion import frame_source, pilot
 from companion.link_interface import LinkError
-from companion.mavsdk_connection import RATE_HZ, signed
+from companion.mavsdk_connection import RATE_HZ
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import age_of
 from companion.watchdog import ThreadGuard
@@ -171,6 +171,24 @@ def _recording(asked: stand_alone.StandAloneCompanion) -> Any:
     return addons.load_entry("companion", "RECORDERS", "black_box", option, "black_box")
 
 
+LISTEN_S = 1.2
+"""Minimum time to hear all flight controllers of a network [wall s]; heartbeats come at 1 Hz."""
+
+
+def open_link(
+    asked: stand_alone.StandAloneCompanion,
+    clock: Clock,
+    abandon: threading.Event,
+    heard: Callable[[], bool] | None = None,
+) -> MavsdkLink:
+    """Open the requested link to the flight controller; see `MavsdkLink`. Raises UsageError."""
+    return MavsdkLink(
+        *(asked.connect, clock, abandon, heard),
+        signing_key=asked.signing_key,
+        system_id=asked.system_id,
+    )
+
+
 def fly_alone(
     asked: stand_alone.StandAloneCompanion,
     mission: MissionSetup,
@@ -192,17 +210,17 @@ def fly_alone(
         if phase != "done":
             link.tell(f"airl: {phase}")
 
-    # The order of contexts is the order of closing: the link closes before proxy and camera.
+    # Reverse order of closing: the link closes before the camera.
     with (
         scheduling.held_to(asked.cpu_quota),
         closing(mission_camera(asked, mission, clock)) as camera,
-        signed(asked.connect, asked.signing_key) as url,
-        closing(MavsdkLink(url, clock, abandon)) as link,
+        closing(open_link(asked, clock, abandon)) as link,
     ):
         waiting()
         link.connect(asked.connect_timeout, stop)
         # The camera is checked before the status messages start, and before take-off.
         pilot.check_camera(mission.policy, camera, stop, mission.compensator)
+        link.check_alone(LISTEN_S)
         with (
             reporting(asked, mission, link, camera, clock) as frames,
             recorded(asked, mission, link, clock) as box,
@@ -264,11 +282,9 @@ def check_on_ground(
             # The newest frame serves as input for the timed decisions.
             seen = camera.latest()
             try:
-                with (
-                    signed(asked.connect, asked.signing_key) as url,
-                    closing(MavsdkLink(url, clock, stop)) as link,
-                ):
+                with closing(open_link(asked, clock, stop)) as link:
                     link.connect(asked.connect_timeout, stop)
+                    link.check_alone(LISTEN_S)
                     yield from look_at_vehicle(link, mission, stop)
                     if seen is not None and not stop.is_set():
                         yield time_decisions(mission, seen, link.kinematics())

@@ -37,7 +37,8 @@ MAX_STREAMS = 256
 
 UNSIGNED_IDS = frozenset((0, 109, 246, 247))
 """HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION: accepted by PX4 without a signature, as radios
-and transponders have no key (PX4 PR 25284)."""
+and transponders have no key (PX4 PR 25284). Here the first signed frame ends that: an unsigned HEARTBEAT
+could report a mode that the vehicle does not have."""
 
 _MARKER = 0xFD
 _HEADER = 10
@@ -61,11 +62,15 @@ class Signing:
         self.key = key
         self.timestamp = timestamp
         """Newest time stamp, local or received."""
+        self.floor = 0
+        """Time stamp up to which frames of new senders are rejected: an earlier program heard them."""
         self.refused = 0
         """Number of unsigned, forged or outdated frames."""
         self.on_key: Callable[[], None] = lambda: None
         """Callback for a change of the key."""
         self._streams: dict[tuple[int, int, int], int] = {}
+        self._own: set[bytes] = set()
+        """System and component ids of signed frames: their echo is a replay."""
         self._began: Callable[[], hashlib._Hash] = hashlib.sha256
         self.change(key, timestamp)
 
@@ -75,6 +80,7 @@ class Signing:
             raise ValueError(f"a key of {len(key)} bytes: must have {KEY_BYTES}")
         self.key = key
         self.timestamp = min(timestamp, _LAST)
+        self.floor = 0
         self._streams.clear()
         if key is not None:
             self._began = hashlib.sha256(key).copy
@@ -84,6 +90,7 @@ class Signing:
         """Return a MAVLink 2 frame with a signature; unchanged if it is signed or without a key."""
         if self.key is None or frame[0] != _MARKER or frame[2] & _SIGNED:
             return frame
+        self._own.add(frame[5:7])
         self.timestamp = min(max(self.timestamp + 1, self._now()), _LAST)
         length = frame[1]
         crc = int.from_bytes(frame[-_CHECKSUM:], "little") ^ _flag_in_checksum(length)
@@ -99,33 +106,34 @@ class Signing:
         )
         return covered + self._signature(covered)
 
-    def accepts(self, frame: bytes) -> bool:
+    def accepts(self, frame: bytes, *, unsigned: bool = True) -> bool:
         """Return True if a frame is accepted; its time stamp is then used up.
 
-        Without a key all frames are accepted. The frame's checksum is not verified.
+        Without a key all frames are accepted. The frame's checksum is not verified. `unsigned`
+        accepts `UNSIGNED_IDS` without a signature until the first signed frame.
         """
         if self.key is None:
             return True
-        accepted = self._accepts(frame)
+        accepted = self._accepts(frame, unsigned and not self._streams)
         self.refused += not accepted
         return accepted
 
-    def _accepts(self, frame: bytes) -> bool:
+    def _accepts(self, frame: bytes, unsigned: bool) -> bool:
         if frame[0] != _MARKER:
-            return frame[5] in UNSIGNED_IDS
+            return unsigned and frame[5] in UNSIGNED_IDS
         if not frame[2] & _SIGNED:
-            return int.from_bytes(frame[7:10], "little") in UNSIGNED_IDS
+            return unsigned and int.from_bytes(frame[7:10], "little") in UNSIGNED_IDS
         stream = frame[-SIGNATURE_BYTES], frame[5], frame[6]
         timestamp = int.from_bytes(frame[-12:-6], "little")
         newest = self._streams.get(stream)
         if newest is None:
-            if timestamp + LATE < max(self.timestamp, self._now()):
+            if timestamp <= self.floor or timestamp + LATE < max(self.timestamp, self._now()):
                 return False
         elif timestamp <= newest:
             return False
         if not hmac.compare_digest(self._signature(frame[:-6]), frame[-6:]):
             return False
-        if newest is None and len(self._streams) >= MAX_STREAMS:
+        if frame[5:7] in self._own or (newest is None and len(self._streams) >= MAX_STREAMS):
             return False
         self._streams[stream] = timestamp
         self.timestamp = max(self.timestamp, timestamp)
@@ -214,6 +222,7 @@ class StoredSigning:
         self.signing = Signing(calendar_us)
         if path is not None:
             self.signing.change(read_key(path), _read_stamp(_stamp_path(path)))
+            self.signing.floor = self.signing.timestamp
             self.signing.on_key = self._store_key
         self._next_us = self._clock.time_us() + SAVE_EVERY_US
 

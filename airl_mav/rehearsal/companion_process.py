@@ -21,7 +21,6 @@ from airl_mav.rehearsal.live_view import view_part
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.frame_source import open_camera
 from companion.link_interface import LinkError
-from companion.mavsdk_connection import signed
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import Mission, check_camera, fly_mission
 from companion.watchdog import ThreadGuard
@@ -72,8 +71,12 @@ class MissionRunner:
         with (
             held_to(aircraft.cpu_quota),
             closing(open_camera(f"tcp://{LOOPBACK}:{camera_port}", clock)) as frames,
-            signed(f"udpin://{LOOPBACK}:{aircraft.companion_port}", aircraft.signing_key) as url,
-            closing(MavsdkLink(url, clock, self._abandon)) as link,
+            closing(
+                MavsdkLink(
+                    *(f"udpin://{LOOPBACK}:{aircraft.companion_port}", clock, self._abandon),
+                    signing_key=aircraft.signing_key,
+                )
+            ) as link,
         ):
             self._harness.send(channel.Ready())
             while not isinstance(request := self._requests.get(), channel.Shutdown):

@@ -161,6 +161,13 @@ class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
         "sign MAVLink with the key in this file, that of the flight controller (64"
         " hexadecimal digits, mode 0600); over udpin:// only"
     )
+    system_id: int | None = quantity(
+        "MAVLink system id of the vehicle to fly; by default the only vehicle on the network",
+        "1",
+        ge=1,
+        le=255,
+        default=None,
+    )
     policy: model.PolicyName = model.DEFAULT_POLICY
     goal: Annotated[Goal, COMMON] = Field(
         default=(20.0, 0.0),

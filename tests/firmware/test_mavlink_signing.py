@@ -5,7 +5,9 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import closing
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +21,15 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.signing import StoredSigning, read_key, write_key
 from companion.link_interface import LinkError
-from companion.mavsdk_connection import SigningProxy, signed
+from companion.mavsdk_connection import SigningProxy, autopilots
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.autopilot.autopilot_state import Arming
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.px4_links import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from tests.support.kinematic_autopilot import KinematicAutopilot
+from tests.support.forged_frames import ForgedFrames
+from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS, KinematicAutopilot, Parameters
 from tests.support.mavlink_clients import (
     BOOT_UNIX_US,
     Companion,
@@ -109,6 +113,26 @@ def test_a_replayed_command_is_refused_on_every_link(rig: Rig) -> None:
     assert sum(link.refused for link in rig.bench.server.counters().values()) == 2
 
 
+def test_ten_thousand_frames_without_the_key_have_no_effect(rig: Rig) -> None:
+    """From the address of the companion, whose one signed frame ends the unsigned HEARTBEATs."""
+    sign_with(rig.client)
+    rig.client.command(400, 1)
+    rig.bench.tick()
+    counters, heartbeats = rig.bench.server.counters, list(rig.autopilot.gcs_heartbeats)
+    heard = {name: link.rx for name, link in counters().items()}
+    forged = ForgedFrames()
+    forged.hear(b"".join(rig.client.endpoint.take()))
+    for _ in range(100):
+        for frame in forged.take(100):
+            rig.client.endpoint.inbox.append(frame)
+            rig.station.endpoint.inbox.append(frame)
+        rig.bench.tick()
+    assert {name: link.rx for name, link in counters().items()} == heard
+    assert rig.autopilot.commands == ["arm force=False"]
+    assert rig.autopilot.gcs_heartbeats == heartbeats
+    assert not rig.autopilot.received and not rig.autopilot.setpoints
+
+
 def test_the_key_changes_with_the_key_alone_and_not_in_flight(rig: Rig) -> None:
     other = bytes(range(50, 82))
     sign_with(rig.client)
@@ -134,16 +158,18 @@ def test_the_key_changes_with_the_key_alone_and_not_in_flight(rig: Rig) -> None:
 class Flying:
     """A server on UDP with a key file, ticking on a thread."""
 
-    def __init__(self, path: Path, api: int) -> None:
+    def __init__(self, path: Path | None, api: int, system_id: int = 1) -> None:
         endpoint = UdpEndpoint(
             (LOOPBACK, 0), (LOOPBACK, api), local_option="--a", remote_option="--b"
         )
-        self.autopilot = KinematicAutopilot()
+        self.autopilot = KinematicAutopilot(
+            Parameters(DEFAULT_PARAMETERS | {"MAV_SYS_ID": system_id})
+        )
         self.server = MavlinkServer(
             [onboard_link(endpoint)],
             self.autopilot,
             boot_unix_us=BOOT_UNIX_US,
-            signing=StoredSigning(path),
+            signing=None if path is None else StoredSigning(path),
         )
         self.lock = threading.Lock()
         self._stop = threading.Event()
@@ -189,24 +215,147 @@ def test_mavutil_with_setup_signing(key: Path) -> None:
     assert read_key(key) == KEY
 
 
+def link_to(api: int, key: Path | None, **options: Any) -> MavsdkLink:
+    url = f"udpin://{LOOPBACK}:{api}"
+    return MavsdkLink(url, WallClock(), threading.Event(), signing_key=key, **options)
+
+
 def test_mavsdk_flies_through_the_signing_proxy(key: Path) -> None:
     (api,), _ = free_ports(1, 0)
-    with (
-        closing(SigningProxy(f"udpin://{LOOPBACK}:{api}", key)) as proxy,
-        closing(Flying(key, api)) as flying,
-    ):
-        mavsdk = _new_mavsdk(ComponentType.COMPANION_COMPUTER)
-        assert mavsdk.add_any_connection(proxy.url) == 0
-        companion = Companion(mavsdk)
-        try:
-            wait_for(lambda: flying.autopilot.arming is Arming.STANDBY)
-            companion.plugin(Action).arm()
-            assert flying.autopilot.arming is Arming.ARMED
-        finally:
-            companion.destroy()
+    with closing(Flying(key, api)) as flying, closing(link_to(api, key)) as link:
+        link.connect(20.0)
+        wait_for(lambda: flying.autopilot.arming is Arming.STANDBY)
+        link._action.arm()
+        assert flying.autopilot.arming is Arming.ARMED
         counters = flying.server.counters()["onboard"]
         assert counters.rx > 0
-        assert (counters.refused, proxy.refused) == (0, 0)
+        assert (counters.refused, link._proxy.refused) == (0, 0)
+
+
+class Vehicle:
+    """A vehicle's frames, made by pymavlink, for a companion's proxy."""
+
+    def __init__(self, key: Path) -> None:
+        (api,), _ = free_ports(1, 0)
+        self.proxy = SigningProxy(f"udpin://{LOOPBACK}:{api}", key)
+        now = self.proxy._stored.signing._now()
+        self.stamps = count(now)
+
+    def frame(self, system: int = 1, link: int = 0, key: bytes | None = KEY) -> bytes:
+        mav = dialect.MAVLink(None, system, 1)
+        mav.signing.secret_key, mav.signing.sign_outgoing = key, key is not None
+        mav.signing.link_id, mav.signing.timestamp = link, next(self.stamps)
+        frame: bytes = dialect.MAVLink_heartbeat_message(2, 12, 1, 0, 3, 3).pack(mav)
+        return frame
+
+    def passes(self, frame: bytes, port: int = 14580) -> bool:
+        return self.proxy._accepts(frame, (LOOPBACK, port))
+
+    def close(self) -> None:
+        self.proxy.close()
+
+
+@pytest.fixture
+def vehicle(key: Path) -> Iterator[Vehicle]:
+    with closing(Vehicle(key)) as made:
+        yield made
+
+
+def test_the_proxy_passes_nothing_unsigned(vehicle: Vehicle) -> None:
+    """Also before the vehicle is heard: MAVSDK connects to the first flight controller."""
+    for system in (7, 1):
+        assert not vehicle.passes(vehicle.frame(system, key=None), 9)
+        assert not vehicle.passes(vehicle.frame(system, key=bytes(32 * [1])), 9)
+    assert vehicle.passes(vehicle.frame())
+    assert not vehicle.passes(vehicle.frame(key=None), 9)
+    assert vehicle.proxy._vehicles == {1: (LOOPBACK, 14580)}
+
+
+def test_a_replayed_frame_neither_passes_nor_diverts_the_companion(vehicle: Vehicle) -> None:
+    frames = [vehicle.frame() for _ in range(3)]
+    # To a ground station, and signed: it may be older than the newest telemetry here.
+    other = [vehicle.frame(link=1) for _ in range(2)]
+    assert vehicle.passes(frames[1])
+    assert not any(vehicle.passes(frame, 9) for frame in (*frames[:2], *other))
+    assert vehicle.proxy._vehicles == {1: (LOOPBACK, 14580)}
+    assert vehicle.passes(frames[2])
+    assert vehicle.proxy.refused == 4
+
+
+def test_the_companion_sends_to_the_named_vehicle_alone(key: Path) -> None:
+    with closing(Vehicle(key)) as vehicle:
+        vehicle.proxy._system_id = 2
+        assert vehicle.passes(vehicle.frame(1), 14580)
+        assert vehicle.passes(vehicle.frame(2), 14581)
+        assert vehicle.proxy._vehicles == {2: (LOOPBACK, 14581)}
+
+
+def test_a_third_sender_neither_ends_a_flight_nor_hides_a_takeover(key: Path) -> None:
+    (api,), _ = free_ports(1, 0)
+    forged, stop = ForgedFrames(), threading.Event()
+
+    def attack() -> None:
+        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
+            while not stop.wait(0.002):
+                for frame in forged.take(5):
+                    sender.sendto(frame, (LOOPBACK, api))
+
+    attacker = threading.Thread(target=attack)
+    with closing(link_to(api, key)) as link:
+        attacker.start()
+        try:
+            time.sleep(0.2)  # An invented vehicle speaks first.
+            with closing(Flying(key, api)) as flying:
+                link.connect(20.0)
+                assert list(autopilots(link._mavsdk)) == [1]
+                wait_for(lambda: flying.autopilot.arming is Arming.STANDBY)
+                link._action.arm()
+                wait_for(lambda: link.status().armed)
+                # The lies: disarmed, Offboard, Position.
+                told = set()
+                for _ in range(100):
+                    told.add((link.connected, link.armed, link.status().mode))
+                    time.sleep(0.005)
+                assert told == {(True, True, "hold")}
+                with flying.lock:
+                    flying.autopilot.mode = Mode.STABILIZED
+                wait_for(lambda: link.status().mode == "stabilized")
+                for _ in range(50):
+                    assert link.status().mode == "stabilized"
+                    time.sleep(0.005)
+        finally:
+            stop.set()
+            attacker.join()
+    assert forged.sent.total() > 500
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_of_two_vehicles_the_named_one_is_flown(signed: bool, key: Path, tmp_path: Path) -> None:
+    (api,), _ = free_ports(1, 0)
+    keys = [None] * 3
+    if signed:
+        keys = [tmp_path / name for name in "012"]
+        for path in keys:
+            write_key(path, KEY)
+    with (
+        closing(Flying(keys[0], api, 1)) as first,
+        closing(Flying(keys[1], api, 2)) as second,
+    ):
+        with closing(link_to(api, keys[2])) as link:
+            link.connect(20.0)
+            with pytest.raises(LinkError, match=r"systems 1, 2; choose one with .*--system-id"):
+                link.check_alone(1.5)
+        with closing(link_to(api, keys[2], system_id=2)) as link:
+            link.connect(20.0)
+            link.check_alone(1.5)
+            link._action.arm()
+        assert second.autopilot.arming is Arming.ARMED
+        assert first.autopilot.arming is Arming.STANDBY
+        with (
+            closing(link_to(api, keys[2], system_id=3)) as link,
+            pytest.raises(LinkError, match="no system 3 heard on "),
+        ):
+            link.connect(0.5)
 
 
 def test_a_companion_with_another_key_is_told_so(key: Path, tmp_path: Path) -> None:
@@ -216,9 +365,8 @@ def test_a_companion_with_another_key_is_told_so(key: Path, tmp_path: Path) -> N
     url = f"udpin://{LOOPBACK}:{api}"
     with (
         closing(Flying(key, api)),
+        closing(link_to(api, other)) as link,
         pytest.raises(LinkError, match=rf"heard on {url} in 1 s \(\d+ frames refused: bad sig"),
-        signed(url, other) as proxied,
-        closing(MavsdkLink(proxied, WallClock(), threading.Event())) as link,
     ):
         link.connect(1.0)
 
@@ -232,28 +380,6 @@ def test_a_companion_without_the_key_is_told_so(key: Path) -> None:
         pytest.raises(LinkError, match=r"^no telemetry: .* wants signed messages .--signing-key."),
     ):
         link.connect(20.0)
-
-
-def test_the_proxy_signs_for_mavsdk_alone(key: Path) -> None:
-    """Else any program on the companion computer could command the vehicle without the key."""
-    (api,), _ = free_ports(1, 0)
-    with (
-        closing(SigningProxy(f"udpin://{LOOPBACK}:{api}", key)) as proxy,
-        closing(Flying(key, api)) as flying,
-        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as mavsdk,
-        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other,
-    ):
-        mavsdk.bind((LOOPBACK, int(proxy.url.rpartition(":")[2])))
-        mavsdk.settimeout(20.0)
-        _, signer = mavsdk.recvfrom(4096)
-        plain = dialect.MAVLink(None, 245, 190)
-        arm = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0] * 6)
-        other.sendto(arm.pack(plain), signer)
-        mavsdk.sendto(dialect.MAVLink_ping_message(1, 7, 0, 0).pack(plain), signer)
-        wait_for(lambda: flying.server.counters()["onboard"].rx > 0)
-        time.sleep(0.1)
-        assert flying.server.counters()["onboard"].rx == 1
-        assert flying.autopilot.arming is Arming.STANDBY
 
 
 def test_a_proxy_without_a_host_is_on_this_machine_alone(key: Path) -> None:

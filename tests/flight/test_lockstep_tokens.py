@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.addons.remote_lockstep.vehicle_side import RemoteStage
 from airl_mav.core.frames import Goal
@@ -37,6 +38,7 @@ from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
+from tests.support.forged_frames import ForgedFrames
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports
 from tests.support.processes import ROOT, Running, running
@@ -255,12 +257,15 @@ class Relay:
             ready, _, _ = select.select([self._near, self._far], [], [], 0.1)
             if self._near in ready:
                 data, self._vehicle = self._near.recvfrom(65_536)
-                if not self._lost(data):
-                    self._far.sendto(data, self._companion)
+                self._pass(data, self._far, self._companion)
             if self._far in ready:
                 data = self._far.recv(65_536)
-                if self._vehicle is not None and not self._lost(data):
-                    self._near.sendto(data, self._vehicle)
+                if self._vehicle is not None:
+                    self._pass(data, self._near, self._vehicle)
+
+    def _pass(self, data: bytes, by: socket.socket, to: tuple[str, int]) -> None:
+        if not self._lost(data):
+            by.sendto(data, to)
 
     def _lost(self, data: bytes) -> bool:
         self.unsigned += not data[2] & 1
@@ -276,6 +281,29 @@ class Relay:
         self._thread.join()
         self._near.close()
         self._far.close()
+
+
+class Attacker(Relay):
+    """Sends forged, replayed and unsigned frames of all kinds around every datagram."""
+
+    EACH = 4
+    """Frames before a datagram, from the real sender's address; as many after it, from another."""
+
+    def __init__(self, near_port: int, far_port: int) -> None:
+        self.forged = ForgedFrames()
+        self._stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        super().__init__(near_port, far_port)
+
+    def close(self) -> None:
+        super().close()
+        self._stranger.close()
+
+    def _pass(self, data: bytes, by: socket.socket, to: tuple[str, int]) -> None:
+        # Few datagrams: a full socket buffer would lose telemetry, on which the flight depends.
+        by.sendto(b"".join(self.forged.take(self.EACH)), to)
+        by.sendto(data, to)
+        self.forged.hear(data)
+        self._stranger.sendto(b"".join(self.forged.take(self.EACH)), to)
 
 
 @pytest.fixture
@@ -302,6 +330,27 @@ def test_neither_lost_words_nor_a_key_change_the_flight(
     assert min(relay.dropped["F"], relay.dropped["D"]) >= 10, relay.dropped
     assert relay.unsigned == 0
     assert lanes | lanes_in(companion.text()) == reference.lanes
+
+
+@pytest.mark.nightly  # Frame by frame: test_mavlink_signing.py.
+def test_forged_replayed_and_unsigned_frames_change_no_bit_of_the_flight(
+    reference: Reference, tmp_path: Path, key: Path
+) -> None:
+    """The reference is flown without the attacker, and without a wire."""
+    with staged(reference, StoredSigning(key)) as (stage, ports):
+        far = choose_ports().api
+        words = companion_words(far, ports.camera, reference, "--signing-key", str(key))
+        with (
+            closing(Attacker(ports.api, far)) as attacker,
+            running(words, tmp_path) as companion,
+        ):
+            lanes = fly_staged(stage)
+            assert companion.wait() == 0, companion.text()
+    assert lanes | lanes_in(companion.text()) == reference.lanes
+    sent = attacker.forged.sent
+    assert sent.total() >= 10_000
+    assert min(sent[how] for how in ("unsigned", "forged", "replayed")) >= 1000
+    assert attacker.forged.kinds == set(dialect.mavlink_map)
 
 
 @pytest.mark.nightly  # Refused: test_mavlink_signing.py.

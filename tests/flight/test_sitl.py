@@ -9,7 +9,7 @@ import socket
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
+from airl_mav.core.constants import LOOPBACK
+from airl_mav.core.signing import write_key
 from airl_mav.latency.injection import build_sampler
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import load_computer
@@ -26,6 +28,7 @@ from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from tests.support.command_line import airl
 from tests.support.foreign_messages import CHANGED, FOREIGN
+from tests.support.forged_frames import ForgedFrames
 from tests.support.mavlink_clients import RawClient
 from tests.support.ports import choose_ports
 from tests.support.processes import SITL, SITL_WITHOUT_REPORT, running, write_arena
@@ -317,6 +320,34 @@ def test_injected_latency(tmp_path: Path) -> None:
     assert injection["latency"]["mean_ms"] == 396.0
     assert "396 ± 19.8 ms of injected latency" in run.output
     assert "as if Raspberry Pi 4" in (run.folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.nightly  # Bit by bit, in lockstep: test_lockstep_tokens.py.
+def test_a_third_sender_does_not_end_a_signed_flight(tmp_path: Path) -> None:
+    key, ports, forged = tmp_path / "key", choose_ports(), ForgedFrames()
+    write_key(key, bytes(range(1, 33)))
+    words = [*SITL_WITHOUT_REPORT, *ports.options(), "--out", str(tmp_path / "run")]
+    words += ["--arena", "no-obstacles", "--episodes", "1", "--signing-key", str(key)]
+    stop = threading.Event()
+
+    def attack() -> None:
+        with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
+            while not stop.wait(0.02):
+                for port in (ports.api, ports.api_local, ports.gcs_local):
+                    for frame in forged.take(6):
+                        sender.sendto(frame, (LOOPBACK, port))
+
+    attacker = threading.Thread(target=attack)
+    attacker.start()
+    try:
+        with running(words, tmp_path) as process:
+            assert process.wait(250.0) == 0, process.text()
+    finally:
+        stop.set()
+        attacker.join()
+    assert forged.sent.total() >= 5_000
+    (line,) = (tmp_path / "run" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+    assert json.loads(line)["outcome"] == "success"
 
 
 @pytest.mark.nightly

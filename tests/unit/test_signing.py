@@ -126,6 +126,31 @@ def test_unsigned_frames_are_refused_but_for_what_radios_send() -> None:
     assert signing(None).accepts(messages()[0].pack(plain))
 
 
+def test_after_one_signed_frame_no_unsigned_one_counts() -> None:
+    """A HEARTBEAT in the name of any system, also one that never signs."""
+    ours = signing()
+    beats = [
+        messages()[1].pack(dialect.MAVLink(None, system, component), force_mavlink1=old)
+        for system, component in ((1, 1), (245, 190), (7, 1))
+        for old in (False, True)
+    ]
+    assert all(map(ours.accepts, beats))
+    assert not any(ours.accepts(beat, unsigned=False) for beat in beats)
+    assert not ours.accepts(messages()[0].pack(peer(OTHER)))
+    assert all(map(ours.accepts, beats))
+    assert ours.accepts(messages()[0].pack(peer()))
+    assert not any(map(ours.accepts, beats))
+    ours.change(OTHER)
+    assert all(map(ours.accepts, beats))
+
+
+def test_own_frames_do_not_come_back() -> None:
+    ours = signing()
+    frame = ours.sign(messages()[0].pack(dialect.MAVLink(None, 1, 1)), 0)
+    assert signing().accepts(frame)
+    assert not ours.accepts(frame)
+
+
 def _empty(kind: Any) -> Any:
     values = {
         name: b"" if of == "char" else [0] * n if n else 0
@@ -218,6 +243,9 @@ def test_key_and_newest_time_stamp_outlive_the_program(tmp_path: Path) -> None:
     late = StoredSigning(path, clock)
     assert late.signing.timestamp == NOW * 3
     assert not late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 2)))
+    # So are those of the last minute: the earlier program may have heard them.
+    assert not late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 3)))
+    assert late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 3 + 1)))
     stored.signing.change(OTHER, 7)
     assert read_key(path) == OTHER
     assert StoredSigning(path).signing.timestamp == 7

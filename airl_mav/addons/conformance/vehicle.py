@@ -75,7 +75,7 @@ class VehicleConnection:
 
     def connect(self, timeout_s: float) -> None:
         """Wait for a flight controller. Raises UsageError on timeout [wall s]."""
-        system = mavsdk_connection.first_autopilot(self._mavsdk, timeout_s)
+        system = mavsdk_connection.find_autopilot(self._mavsdk, timeout_s)
         if system is None:
             heard = f"no flight controller heard in {timeout_s:g} s (connect_timeout_s)"
             raise errors.FieldError("connect", self.url, problem=heard)

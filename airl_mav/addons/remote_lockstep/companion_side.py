@@ -11,7 +11,7 @@ from airl_mav.addons.remote_lockstep.turns import TokenFrameSource, TokenTurns
 from airl_mav.latency.injection import FixedSampler
 from airl_mav.lockstep.turns import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario import checks, stand_alone
-from companion import frame_source, mavsdk_connection, mavsdk_link, pilot, program, watchdog
+from companion import frame_source, pilot, program, watchdog
 
 ANSWER_TIMEOUT_S = 20.0
 """Timeout after which MAVSDK repeats a command, at most four times [wall s]. Long enough for all
@@ -51,9 +51,8 @@ def fly_in_lockstep(
 
     with (
         closing(frame_source.open_camera(asked.camera, clock)) as frames,
-        mavsdk_connection.signed(asked.connect, asked.signing_key) as url,
         # The simulator controls time: ignore silence in wall time.
-        closing(mavsdk_link.MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
+        closing(program.open_link(asked, clock, abandon, heard=lambda: True)) as link,
     ):
         waiting()
         # MAVSDK's timeout ends the wait for a vehicle that rejects unsigned messages, and lets an

@@ -24,7 +24,7 @@ from airl_mav.lockstep.turns import Handle, LockstepError, Turn
 from airl_mav.rehearsal.episode import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from firmware_sim.firmware import FrameServer
-from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, is_signed
+from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import Peer, Sender, UdpEndpoint
 
 KNOCK_S = 0.1
@@ -366,8 +366,6 @@ class Wire:
         self._decoder = Decoder(datagrams=True)
         self._preset = endpoint.towards(None)
         self._learned: tuple[Peer, Sender] | None = None
-        self._known = stored is None
-        """True after a message that only a companion can have sent."""
         self._kept: tuple[Peer] | None = None
         # Discards what an earlier companion has left in the socket.
         endpoint.receive()
@@ -394,10 +392,7 @@ class Wire:
                 continue
             messages = self._decoder.feed(data)
             accepted = self._accepted(messages)
-            # Unsigned messages that are accepted do not identify a companion, so no data is sent to
-            # it.
-            self._known = self._known or any(map(is_signed, accepted))
-            if not accepted or not self._known:
+            if not accepted:
                 continue
             # Answers go to the newest accepted sender.
             if peer is not None and (self._learned is None or peer != self._learned[0]):
@@ -424,7 +419,9 @@ class Wire:
         if self._stored is None:
             return messages
         signing = self._stored.signing
-        accepted = [m for m in messages if signing.accepts(bytes(m.get_msgbuf()))]
+        # A companion with the key signs everything; other senders get no telemetry.
+        frames = ((m, bytes(m.get_msgbuf())) for m in messages)
+        accepted = [m for m, frame in frames if signing.accepts(frame, unsigned=False)]
         self.refused += len(messages) - len(accepted)
         return accepted
 
