@@ -37,8 +37,8 @@ MAX_STREAMS = 256
 
 UNSIGNED_IDS = frozenset((0, 109, 246, 247))
 """HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION: accepted by PX4 without a signature, as radios
-and transponders have no key (PX4 PR 25284). Here the first signed frame ends that: an unsigned HEARTBEAT
-could report a mode that the vehicle does not have."""
+and transponders have no key (PX4 PR 25284). Here the first signed frame ends that: a HEARTBEAT
+reports modes and announces systems."""
 
 _MARKER = 0xFD
 _HEADER = 10
@@ -63,7 +63,7 @@ class Signing:
         self.timestamp = timestamp
         """Newest time stamp, local or received."""
         self.floor = 0
-        """Time stamp up to which frames of new senders are rejected: an earlier program heard them."""
+        """Time stamp up to which an earlier program may have accepted frames; they are rejected."""
         self.refused = 0
         """Number of unsigned, forged or outdated frames."""
         self.on_key: Callable[[], None] = lambda: None
