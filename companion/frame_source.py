@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import zmq
+from zmq.utils import z85
 
 from airl_mav.camera.frame import MOST_BYTES, Frame, FrameError
 from airl_mav.camera.intrinsics import Intrinsics
@@ -55,9 +56,16 @@ class ZmqFrameSource:
     """
 
     def __init__(
-        self, endpoint: str, clock: Clock, context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self,
+        endpoint: str,
+        clock: Clock,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+        key: bytes | None = None,
     ) -> None:
-        """Connect to an endpoint such as "tcp://192.168.1.2:5560", or raise FieldError."""
+        """Connect to an endpoint such as "tcp://192.168.1.2:5560", or raise FieldError.
+
+        `key` is CURVE's secret key of the publisher; None = unencrypted.
+        """
         self.malformed = 0
         """Number of invalid messages, or frames of another size than the first frame."""
         self.failure: str | None = None
@@ -79,6 +87,12 @@ class ZmqFrameSource:
         self._silent = WallClock()
         """Time since the last message or the last connection attempt."""
         try:
+            if key is not None:
+                # The subscriber's own key pair is new each time: the publisher accepts any.
+                public, secret = zmq.curve_keypair()
+                self._socket.setsockopt(zmq.CURVE_PUBLICKEY, public)
+                self._socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
+                self._socket.setsockopt(zmq.CURVE_SERVERKEY, zmq.curve_public(z85.encode(key)))
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
@@ -165,13 +179,16 @@ class SharedFrames:
                 return found
 
 
-def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
-    """Connect to the camera at a ZeroMQ address. Raises FieldError for an unusable address."""
+def open_camera(endpoint: str, clock: Clock, key: bytes | None = None) -> ZmqFrameSource:
+    """Connect to the camera at a ZeroMQ address; see `ZmqFrameSource`.
+
+    Raises FieldError for an unusable address.
+    """
     port = endpoint.rpartition(":")[2]
     # libzmq would silently truncate the number to 16 bits.
     if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
         raise errors.FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
-    return ZmqFrameSource(endpoint, clock)
+    return ZmqFrameSource(endpoint, clock, key=key)
 
 
 class OpenCamera(FrameSource, Protocol):
@@ -195,15 +212,17 @@ def open_named_camera(
     wanted: Intrinsics,
     whose: str,
     further: Mapping[str, Intrinsics] | None = None,
+    key: bytes | None = None,
 ) -> OpenCamera:
     """Open a camera by name; FieldError if it is missing, sees too little or has no depth.
 
     A name is tcp://HOST:PORT or ipc://PATH (images are used unchanged), or a driver's name.
-    Its images are converted to the `wanted` camera of `whose`, such as "vehicle quad".
+    Its images are converted to the `wanted` camera of `whose`, such as "vehicle quad". `key`
+    decrypts the images of an address.
     """
     # An address has a scheme; the publisher defines its own camera, so nothing is converted.
     if "://" in name:
-        return open_camera(name, clock)
+        return open_camera(name, clock, key)
     open_driver = addons.load_entry("companion", "CAMERAS", "driver", ("camera", name), "cameras")
     camera: OpenCamera = open_driver(name, clock, wanted, whose, further)
     return camera

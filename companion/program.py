@@ -133,7 +133,8 @@ def mission_camera(
         cameras = {k: v for k, v in cameras.items() if k in policy.card.observation.cameras}
     further = {name: Intrinsics.of(each) for name, each in cameras.items()}
     wanted, whose = Intrinsics.of(vehicle.camera), f"vehicle {asked.vehicle}"
-    return frame_source.open_named_camera(asked.camera, clock, wanted, whose, further)
+    key = asked.read_camera_key()
+    return frame_source.open_named_camera(asked.camera, clock, wanted, whose, further, key)
 
 
 def reporting(

@@ -11,6 +11,7 @@ import contextlib
 import functools
 import hashlib
 import hmac
+import ipaddress
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -184,26 +185,65 @@ def frames_of(datagram: bytes) -> Iterator[bytes]:
 OPTION = "signing_key"
 """Field of a scenario with the path of the key file."""
 
+LOCAL_TRANSPORTS = ("ipc", "inproc")
+"""ZeroMQ transports within a machine."""
+
 SAVE_EVERY_US = 60 * US_PER_S
 """Interval at which the newest time stamp is saved [µs of wall time]."""
 
 
-def read_key(path: Path) -> bytes:
+def camera_key(
+    path: Path | None, endpoint: str, field: str, *, insecure: bool = False
+) -> bytes | None:
+    """Return the key of a camera's ZeroMQ socket, the secret key of CURVE; None = unencrypted.
+
+    Publisher and subscribers share the file, so its public key is known to them alone.
+
+    Args:
+        path: Key file; None = no key.
+        endpoint: ZeroMQ address, such as "tcp://192.168.1.2:5600", or the name of a driver.
+        field: Field of the address, for messages.
+        insecure: Allow unencrypted images of other machines.
+
+    Raises:
+        FieldError: The key is invalid or of no use, or other machines need one.
+    """
+    transport, found, address = endpoint.partition("://")
+    if path is not None:
+        if not found:
+            raise FieldError("camera_key", path, "with the ZeroMQ address of a camera")
+        return read_key(path, "camera_key")
+    host = (address.rpartition(":")[0] or address).strip("[]")
+    if found and transport not in LOCAL_TRANSPORTS and not (insecure or _is_loopback(host)):
+        problem = "other machines are on this network and images are unencrypted: give a"
+        problem += " --camera-key, or --insecure on a trusted network"
+        raise FieldError(field, endpoint, problem=problem)
+    return None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def read_key(path: Path, option: str = OPTION) -> bytes:
     """Return the 32 bytes of a file of hexadecimal digits, or raise FieldError."""
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii", errors="replace")
     except OSError as error:
-        raise FieldError(OPTION, path, problem=f"cannot be read: {error.strerror}") from None
+        raise FieldError(option, path, problem=f"cannot be read: {error.strerror}") from None
     if stat.S_IMODE(mode) & 0o077:
         shown = f"{stat.S_IMODE(mode):04o}"
-        raise FieldError(OPTION, path, problem=f"mode {shown}: others may read it; chmod 600 it")
+        raise FieldError(option, path, problem=f"mode {shown}: others may read it; chmod 600 it")
     try:
         key = bytes.fromhex(text)
     except ValueError:
         key = b""
     if len(key) != KEY_BYTES or not any(key):
-        raise FieldError(OPTION, path, problem="no key: must be 64 hexadecimal digits, not all 0")
+        raise FieldError(option, path, problem="no key: must be 64 hexadecimal digits, not all 0")
     return key
 
 

@@ -16,6 +16,7 @@ from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
 from airl_mav.core.resource_use import UseMeter
 from airl_mav.core.scheduling import held_to
+from airl_mav.core.signing import camera_key
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.live_view import view_part
 from airl_mav.scenario.resolve import ResolvedScenario
@@ -64,13 +65,14 @@ class MissionRunner:
     def run(self) -> None:
         """Fly the requested missions until shutdown. Raises UsageError for an unfit camera."""
         aircraft, clock = self._scenario.scenario, self._clock
-        camera_port = aircraft.open_ports.camera_port
+        endpoint = f"tcp://{LOOPBACK}:{aircraft.open_ports.camera_port}"
+        key = camera_key(aircraft.camera_key, endpoint, "camera")
         use = UseMeter(WallClock())
         self._scenario.fresh_policy(aircraft.seed)  # loaded before the first flight
         compensator = self._scenario.compensator()
         with (
             held_to(aircraft.cpu_quota),
-            closing(open_camera(f"tcp://{LOOPBACK}:{camera_port}", clock)) as frames,
+            closing(open_camera(endpoint, clock, key)) as frames,
             closing(
                 MavsdkLink(
                     *(f"udpin://{LOOPBACK}:{aircraft.companion_port}", clock, self._abandon),

@@ -21,7 +21,7 @@ from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Geodetic, Goal, quat_yaw
-from airl_mav.core.signing import StoredSigning
+from airl_mav.core.signing import StoredSigning, camera_key
 from airl_mav.faults import PROCESSES, Fault, link_fails
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import check_noise, check_renderer
@@ -84,7 +84,7 @@ def build_firmware(
         )
 
     signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
-    insecure = insecure or signing is not None
+    open_camera, insecure = insecure, insecure or signing is not None
     flight_stack: FlightStack
     failing: fault_timeline.FailingLink | None = None
     if aircraft.firmware == "builtin":
@@ -105,11 +105,18 @@ def build_firmware(
     else:
         flight_stack = real_firmware(FirmwareRequest(aircraft, vehicle, log, ends))
     try:
-        camera = CameraServer(f"tcp://{bind}:{ports.camera_port or '*'}")
+        camera = camera_server(aircraft, bind, insecure=open_camera)
     except UsageError:
         flight_stack.close()
         raise
     return Firmware(flight_stack, camera, pacing, recording=recording, failing=failing)
+
+
+def camera_server(aircraft: Aircraft, bind: str, *, insecure: bool) -> CameraServer:
+    """Bind the camera's socket. Raises UsageError for a bad key, or if other machines need one."""
+    endpoint = f"tcp://{bind}:{aircraft.open_ports.camera_port or '*'}"
+    key = camera_key(aircraft.camera_key, endpoint, "bind", insecure=insecure)
+    return CameraServer(endpoint, key=key)
 
 
 class Service:

@@ -166,6 +166,10 @@ class Aircraft(ProfileModel):
         "sign MAVLink with the key in this file (64 hexadecimal digits, mode 0600), and"
         " refuse what is not signed with it"
     )
+    camera_key: Annotated[Path | None, FREE, "firmware and links"] = optional(
+        "encrypt the camera's images with the key in this file (64 hexadecimal digits,"
+        " mode 0600), and send them to programs with this key only"
+    )
     ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")
 
     @property

@@ -134,6 +134,8 @@ def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str |
     if asked.signing_key is not None and (level != "sitl" or firmware != "builtin"):
         accepted = "at level sitl, with firmware builtin"
         raise FieldError("signing_key", asked.signing_key, accepted)
+    if asked.camera_key is not None and level != "sitl":
+        raise FieldError("camera_key", asked.camera_key, "at level sitl, whose camera has a socket")
     given = {name for name, value in real if value not in (None, False)}
     for kind, names in REAL_FIRMWARE_NEEDS.items():
         mine = [name for name in names if name in given]

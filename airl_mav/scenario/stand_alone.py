@@ -12,6 +12,7 @@ from airl_mav.core.constants import LOOPBACK, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switch
 from airl_mav.core.frames import Goal
+from airl_mav.core.signing import camera_key
 from airl_mav.faults import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario import aircraft, checks, model
@@ -141,16 +142,30 @@ CameraName = Annotated[
 ]
 
 
-class CompanionAddresses(ProfileModel):
-    """Connections of a stand-alone companion to flight controller and camera."""
+class NamedCamera(ProfileModel):
+    """Camera of a stand-alone program."""
 
     GROUP: ClassVar[str] = "firmware and links"
+    camera: Annotated[CameraName, COMMON] = "tcp://127.0.0.1:5600"
+    camera_key: Path | None = optional(
+        "decrypt the images of a ZeroMQ address with the key in this file, that of the"
+        " publisher (64 hexadecimal digits, mode 0600)"
+    )
+    insecure: bool = switch("allow unencrypted images of another machine's camera")
+
+    def read_camera_key(self) -> bytes | None:
+        """Return the camera's key. Raises FieldError for a bad key, or if the camera needs one."""
+        return camera_key(self.camera_key, self.camera, "camera", insecure=self.insecure)
+
+
+class CompanionAddresses(NamedCamera):
+    """Connections of a stand-alone companion to flight controller and camera."""
+
     connect: Annotated[str, COMMON] = Field(
         default="udpin://127.0.0.1:14540",
         description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
         " serial://DEVICE:BAUD",
     )
-    camera: Annotated[CameraName, COMMON] = "tcp://127.0.0.1:5600"
 
 
 class StandAloneCompanion(CompanionAddresses, model.Lateness, model.Decisions):
@@ -281,6 +296,7 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
 
 def check_companion(asked: StandAloneCompanion) -> None:
     """Raise FieldError for errors detectable before a connection is opened."""
+    asked.read_camera_key()
     for metres in asked.goal:
         if not abs(metres) <= FARTHEST_M:
             raise FieldError("goal", metres, f"{-FARTHEST_M:g} <= value <= {FARTHEST_M:g} m")

@@ -217,10 +217,14 @@ class CameraServer:
     transport_us = None
 
     def __init__(
-        self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self,
+        endpoint: str,
+        context: zmq.Context[zmq.Socket[bytes]] | None = None,
+        key: bytes | None = None,
     ) -> None:
         """Bind the socket to an endpoint such as "tcp://127.0.0.1:5560"; port 0 or * = any.
 
+        `key` is CURVE's secret key; None = unencrypted.
         Raises UsageError if the port is in use, or if the endpoint is invalid.
         """
         self._owns_context = context is None
@@ -230,6 +234,10 @@ class CameraServer:
         self._socket.setsockopt(zmq.CONFLATE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
         try:
+            if key is not None:
+                # A subscriber needs the public key, which only the owners of the key can compute.
+                self._socket.setsockopt(zmq.CURVE_SERVER, 1)
+                self._socket.setsockopt(zmq.CURVE_SECRETKEY, key)
             self._socket.bind(endpoint)
         except zmq.ZMQError as error:
             # The constructor fails, so no other code closes the socket.

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 import pickle
+import select
+import socket
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -233,6 +236,65 @@ def test_frame_arrives_whole(transport: str, tmp_path: Path) -> None:
     finally:
         source.close()
         server.close()
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+def test_encrypted_frames_reach_the_owner_of_the_key_alone(transport: str, tmp_path: Path) -> None:
+    endpoint = LOOPBACK if transport == "tcp" else f"ipc://{tmp_path}/camera"
+    server = CameraServer(endpoint, key=bytes(range(1, 33)))
+    keys = [bytes(range(1, 33)), None, bytes(range(2, 34))]
+    owner, *others = [ZmqFrameSource(server.endpoint, SimClock(), key=key) for key in keys]
+    try:
+        np.testing.assert_array_equal(connected(server, owner).frame.depth_mm, frame(0).depth_mm)
+        for sequence in range(1, 20):
+            server.publish(frame(sequence))
+            assert all(other.wait(-1, 0.01) is None for other in others)
+        received = owner.wait(0, 10.0)
+        assert received is not None and received.frame.sequence > 0
+    finally:
+        for each in (owner, *others, server):
+            each.close()
+
+
+def test_a_key_does_not_read_unencrypted_frames() -> None:
+    """Else any program on the network could be the camera."""
+    server = CameraServer(LOOPBACK)
+    source = ZmqFrameSource(server.endpoint, SimClock(), key=bytes(range(1, 33)))
+    try:
+        for sequence in range(30):
+            server.publish(frame(sequence))
+            assert source.wait(-1, 0.01) is None
+    finally:
+        source.close()
+        server.close()
+
+
+def test_pixels_are_not_on_the_wire() -> None:
+    """Bytes of an encrypted connection, between publisher and subscriber."""
+    key, seen = bytes(range(1, 33)), bytearray()
+    with (
+        closing(CameraServer(LOOPBACK, key=key)) as server,
+        closing(socket.create_server(("127.0.0.1", 0))) as listener,
+        closing(
+            ZmqFrameSource(f"tcp://127.0.0.1:{listener.getsockname()[1]}", SimClock(), key=key)
+        ) as source,
+        closing(listener.accept()[0]) as near,
+        closing(
+            socket.create_connection(("127.0.0.1", int(server.endpoint.rpartition(":")[2])))
+        ) as far,
+    ):
+        for _ in range(1000):
+            for here, there in ((near, far), (far, near)):
+                if select.select([here], [], [], 0.002)[0]:
+                    data = here.recv(65_536)
+                    seen += data
+                    there.sendall(data)
+            server.publish(frame(7))
+            if source.latest() is not None:
+                break
+        assert source.latest() is not None
+    assert len(seen) > frame(7).depth_mm.nbytes
+    assert frame(7).depth_mm.tobytes()[:64] not in seen
 
 
 def test_a_panorama_arrives_whole() -> None:

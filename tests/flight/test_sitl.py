@@ -324,10 +324,12 @@ def test_injected_latency(tmp_path: Path) -> None:
 
 @pytest.mark.nightly  # Bit by bit, in lockstep: test_lockstep_tokens.py.
 def test_a_third_sender_does_not_end_a_signed_flight(tmp_path: Path) -> None:
+    """With encrypted images."""
     key, ports, forged = tmp_path / "key", choose_ports(), ForgedFrames()
     write_key(key, bytes(range(1, 33)))
     words = [*SITL_WITHOUT_REPORT, *ports.options(), "--out", str(tmp_path / "run")]
     words += ["--arena", "no-obstacles", "--episodes", "1", "--signing-key", str(key)]
+    words += ["--camera-key", str(key)]
     stop = threading.Event()
 
     def attack() -> None:

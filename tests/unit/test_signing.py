@@ -20,6 +20,7 @@ from airl_mav.core.signing import (
     UNIT_US,
     Signing,
     StoredSigning,
+    camera_key,
     frames_of,
     read_key,
     write_key,
@@ -260,6 +261,48 @@ def test_a_time_stamp_that_cannot_be_written_ends_nothing(tmp_path: Path) -> Non
     (tmp_path / "key.timestamp").mkdir()  # Nothing can take its place.
     stored.save()
     assert stored.signing.key == KEY
+
+
+# --- the camera's key
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp://127.0.0.1:5600", True),
+        ("tcp://127.0.0.9:*", True),
+        ("tcp://localhost:5600", True),
+        ("tcp://[::1]:5600", True),
+        ("ipc:///tmp/camera", True),
+        ("realsense", True),
+        ("tcp://0.0.0.0:5600", False),
+        ("tcp://*:5600", False),
+        ("tcp://192.168.1.2:5600", False),
+        ("tcp://192.168.1.2:1;127.0.0.1:5600", False),
+        ("tcp://127.0.0.1.example.org:5600", False),
+        ("tcp://[::]:5600", False),
+    ],
+)
+def test_images_leave_the_machine_encrypted(endpoint: str, local: bool, tmp_path: Path) -> None:
+    path = tmp_path / "camera.key"
+    write_key(path, KEY)
+    if local:
+        assert camera_key(None, endpoint, "camera") is None
+    else:
+        with pytest.raises(FieldError, match=r"unencrypted: give a --camera-key, or --insecure"):
+            camera_key(None, endpoint, "camera")
+    assert camera_key(None, endpoint, "camera", insecure=True) is None
+    if "://" in endpoint:
+        assert camera_key(path, endpoint, "camera") == KEY
+        path.chmod(0o640)
+        with pytest.raises(FieldError, match=r"^camera_key .*mode 0640.*chmod 600"):
+            camera_key(path, endpoint, "camera")
+
+
+@pytest.mark.parametrize("level", ["gym", "lockstep"])
+def test_a_camera_without_a_socket_refuses_the_key(level: str) -> None:
+    with pytest.raises(FieldError, match=r"camera_key .*accepted: at level sitl"):
+        resolve(Scenario.model_validate({"camera_key": Path("key"), "level": level}))
 
 
 # --- settings without signing

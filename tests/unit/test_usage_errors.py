@@ -171,6 +171,7 @@ def test_sitl_options(refuse: Run, options: list[str], words: list[str]) -> None
         (["--tlog", "nowhere/flight.tlog"], ["--tlog nowhere/flight.tlog", "no folder nowhere"]),
         (["--bind", "0.0.0.0"], ["0.0.0.0:14580", "--insecure"]),  # noqa: S104
         (["--bind", "everywhere"], ["'everywhere'", "IPv4"]),
+        (["--camera-key", "nowhere"], ["--camera-key nowhere: cannot be read"]),
         (["--companion-host", "192.168.1.20"], ["192.168.1.20:14540", "--insecure"]),
         # The other link is bound before, to a free port: another simulator may be running.
         (
@@ -206,6 +207,18 @@ def test_firmware_options(refuse: Run, options: list[str], words: list[str]) -> 
         (["--camera", "tcp://127.0.0.1:70000"], ["--camera tcp://127.0.0.1:70000", "1..65535"]),
         (["--camera", "tcp://127.0.0.1"], ["--camera tcp://127.0.0.1", "tcp://HOST:PORT"]),
         (["--camera", "smoke"], ["--camera smoke:", "tcp://HOST:PORT"]),
+        (
+            ["--camera", "tcp://192.168.1.2:5600"],
+            ["--camera tcp://192", "--camera-key, or --insec"],
+        ),
+        (["--camera", "tcp://simulator:5600"], ["--camera tcp://sim", "--camera-key, or --insec"]),
+        (["--camera-key", "nowhere"], ["--camera-key nowhere: cannot be read"]),
+        (
+            ["--camera", "realsense", "--camera-key", "nowhere"],
+            ["--camera-key nowhere", "ZeroMQ address"],
+        ),
+        (["--system-id", "0"], ["--system-id 0:", "1 <= value <= 255"]),
+        (["--system-id", "256"], ["--system-id 256:", "1 <= value <= 255"]),
         (["--connect", "pigeon://loft"], ["--connect pigeon://loft", "udpin://HOST:PORT"]),
         (["--connect", "udpin://127.0.0.1:70000"], ["--connect udpin://127.0.0.1:70000"]),
     ],

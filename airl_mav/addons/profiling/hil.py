@@ -130,6 +130,8 @@ def _fly(
         goal=GOAL,
         connect=request.connect,
         camera=request.camera,
+        camera_key=request.camera_key,
+        insecure=request.insecure,
         **request.flown_as,
     )
     mission = prepare(asked)

@@ -50,7 +50,7 @@ def fly_in_lockstep(
         progress(phase, clock.time_us())
 
     with (
-        closing(frame_source.open_camera(asked.camera, clock)) as frames,
+        closing(frame_source.open_camera(asked.camera, clock, asked.read_camera_key())) as frames,
         # The simulator controls time: ignore silence in wall time.
         closing(program.open_link(asked, clock, abandon, heard=lambda: True)) as link,
     ):

@@ -21,11 +21,10 @@ from airl_mav.lockstep.lockstep_flight import Judge
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, SEEN, FlightDigest
 from airl_mav.lockstep.vehicle import BOOT_UNIX_US, builtin_vehicle
 from airl_mav.rehearsal.episode import EpisodeSupervisor
-from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, episode_of
+from airl_mav.rehearsal.firmware_process import Listener, aircraft_of, camera_server, episode_of
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import Firmware, FrameServer, LoadedEpisode
 from firmware_sim.mavlink.endpoint import UdpEndpoint
-from firmware_sim.plant.camera import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
 
@@ -156,7 +155,7 @@ def fly_vehicle_in_lockstep(
                 insecure=asked.insecure or stored is not None,
             )
         ) as endpoint,
-        closing(CameraServer(f"tcp://{asked.bind}:{ports.camera_port or '*'}")) as camera,
+        closing(camera_server(asked, asked.bind, insecure=asked.insecure)) as camera,
     ):
         episode, goal = episode_of(asked, vehicle, computer_w)
         warm_up(vehicle, asked.plant)

@@ -19,7 +19,6 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel
 from airl_mav.core.progress import new_console
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
@@ -30,7 +29,7 @@ GIMBAL_PORT = 13_280
 built-in flight controller of `airl-firmware`. This link is fast enough and otherwise unused."""
 
 
-class VideoOptions(ProfileModel):
+class VideoOptions(stand_alone.NamedCamera):
     """Show a camera's images in QGroundControl, or any player of RTP; Ctrl-C ends it.
 
     Ground stations discover the camera by MAVLink's camera protocol and need no settings.
@@ -42,7 +41,6 @@ class VideoOptions(ProfileModel):
         airl video --vehicle quad-rig --camera-name down
     """
 
-    camera: stand_alone.CameraName = "tcp://127.0.0.1:5600"
     vehicle: aircraft.VehicleName = aircraft.DEFAULT_VEHICLE
     camera_name: str | None = Field(
         default=None,
@@ -82,7 +80,8 @@ def run(options: VideoOptions, console: Console | None = None) -> int:
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
-        camera = ShownCamera(options.camera, options.vehicle, profile, options.camera_name)
+        shown = options.camera, options.vehicle, profile, options.camera_name
+        camera = ShownCamera(*shown, options.read_camera_key())
         sent = show_video(
             *(camera, receiver, network, clock, stop),
             lambda text: console.print(text, highlight=False),
@@ -118,6 +117,8 @@ def video_words(asked: model.Scenario, to: str) -> list[str]:
         raise FieldError("video", to, problem="accepted: with a camera port of your choice, not 0")
     camera = f"tcp://{LOOPBACK}:{ports.camera_port}"
     words = ["--camera", camera, "--vehicle", asked.vehicle, "--to", to]
+    if asked.camera_key is not None:
+        words += ["--camera-key", str(asked.camera_key)]
     return [*words, "--connect", _network(asked) or "None"]
 
 

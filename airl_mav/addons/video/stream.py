@@ -338,6 +338,8 @@ class ShownCamera(NamedTuple):
     """Vehicle profile, with the rate, lens and range of the camera."""
     name: str | None = None
     """Name of the additional camera to show; None = the main camera."""
+    key: bytes | None = None
+    """Key that decrypts the images of an address; None = unencrypted."""
 
     @property
     def own(self) -> Camera:
@@ -353,7 +355,7 @@ class ShownCamera(NamedTuple):
         """Open the camera. Raises FieldError like `open_named_camera`."""
         further = {name: Intrinsics.of(each) for name, each in self.profile.cameras.items()}
         wanted, whose = Intrinsics.of(self.profile.camera), f"vehicle {self.vehicle}"
-        return open_named_camera(self.camera, clock, wanted, whose, further)
+        return open_named_camera(self.camera, clock, wanted, whose, further, self.key)
 
     def image(self, frame: Frame) -> Frame | FurtherImage:
         """Return the camera's image of a frame. Raises FieldError without such an image."""
