@@ -22,21 +22,7 @@ from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, Tele
 from airl_mav.core import constants, errors
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.policy import actions, observation
-from companion import link_interface
-from companion.mavsdk_connection import (
-    POSITION,
-    PX4,
-    RAW_TIMEOUT_S,
-    RAW_URL,
-    Dialect,
-    SigningProxy,
-    autopilots,
-    dialect_of,
-    exchange_raw,
-    find_autopilot,
-    open_connection,
-    set_timeout,
-)
+from companion import link_interface, mavsdk_connection
 
 POLL_S = 0.1
 """Interval of checks while waiting for a condition [s]."""
@@ -109,11 +95,16 @@ class MavsdkLink:
         self.setpoints_sent = 0
         """Number of setpoints passed to MAVSDK, without MAVSDK's repetitions."""
         self._system_id = system_id
-        self._proxy: SigningProxy | None = None
+        self._proxy: mavsdk_connection.SigningProxy | None = None
         if signing_key is not None:
-            self._proxy, url = SigningProxy(url, signing_key, system_id), RAW_URL
+            self._proxy, url = (
+                mavsdk_connection.SigningProxy(url, signing_key, system_id),
+                mavsdk_connection.RAW_URL,
+            )
         try:
-            self._mavsdk = open_connection(url, ComponentType.COMPANION_COMPUTER, system_id)
+            self._mavsdk = mavsdk_connection.open_connection(
+                url, ComponentType.COMPANION_COMPUTER, system_id
+            )
         except errors.UsageError:
             self._close_proxy()
             raise
@@ -126,14 +117,14 @@ class MavsdkLink:
         self._offboard: Any = None
         self._texts: Any = None
         self._direct: Any = None
-        self.dialect: Dialect = PX4
+        self.dialect: mavsdk_connection.Dialect = mavsdk_connection.PX4
         """Dialect of the flight controller; PX4 before `connect`."""
         self._asked = False
         """True if the streams were requested since the last mission."""
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
-        system = find_autopilot(self._mavsdk, timeout_s, stop, self._system_id)
+        system = mavsdk_connection.find_autopilot(self._mavsdk, timeout_s, stop, self._system_id)
         if system is None:
             raise self._unheard(timeout_s)
         self._met = WallClock()
@@ -154,7 +145,7 @@ class MavsdkLink:
         if self._system_id is not None or self._heard is not None:
             return
         self._met.sleep_until(int(listen_s * constants.US_PER_S), self._abandon)
-        if len(found := sorted(autopilots(self._mavsdk))) > 1:
+        if len(found := sorted(mavsdk_connection.autopilots(self._mavsdk))) > 1:
             raise link_interface.LinkError(
                 f"several flight controllers are heard on {self.url}: systems"
                 f" {', '.join(map(str, found))}; choose one with airl-companion --system-id"
@@ -185,7 +176,7 @@ class MavsdkLink:
         self._ask_for_streams(stop)
 
     def _ask_for_streams(self, stop: threading.Event | None) -> None:
-        self.dialect = dialect_of(self._system.autopilot_type())
+        self.dialect = mavsdk_connection.dialect_of(self._system.autopilot_type())
         stopwatch = WallClock()
         # The flight controller may reject requests while it boots, so each is repeated.
         for name, rate_hz in self.dialect.streams:
@@ -211,12 +202,12 @@ class MavsdkLink:
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
         """Exchange the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
-        self.set_timeout(RAW_TIMEOUT_S)
-        return exchange_raw(self._mavsdk, sent)
+        self.set_timeout(mavsdk_connection.RAW_TIMEOUT_S)
+        return mavsdk_connection.exchange_raw(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
         """Set the timeout until MAVSDK repeats a request [wall s]; MAVSDK's default is 0.5 s."""
-        set_timeout(self._mavsdk, seconds)
+        mavsdk_connection.set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
         """Exchange STATUSTEXTs with the connected flight controller; return the send function.
@@ -263,7 +254,9 @@ class MavsdkLink:
         flag alternates with contradicting messages (PX4 1.16). Armability is a separate flag.
         """
         health = self._telemetry.health()
-        needed = [flag for flag in self.dialect.health if by_gps or flag not in POSITION]
+        needed = [
+            flag for flag in self.dialect.health if by_gps or flag not in mavsdk_connection.POSITION
+        ]
         flags = [flag for flag in needed if not getattr(health, flag)]
         return [flag.removeprefix("is_").removesuffix("_ok").replace("_", " ") for flag in flags]
 

@@ -27,7 +27,7 @@ class CompanionOptions(StandAloneCompanion):
     Examples:
         airl-companion --goal 20 5
         airl-companion companion.toml --goal 20 5
-        airl-companion --connect serial:///dev/ttyAMA0:921600 --camera tcp://192.168.1.10:5600
+        airl-companion --connect serial:///dev/ttyAMA0:921600 --camera realsense --system-id 2
         airl-companion --check --camera realsense --policy policies/mine
         airl-companion --lockstep --goal 20 5     (with airl-firmware --lockstep)
     """

@@ -252,8 +252,9 @@ def test_encrypted_frames_reach_the_owner_of_the_key_alone(transport: str, tmp_p
         received = owner.wait(0, 10.0)
         assert received is not None and received.frame.sequence > 0
     finally:
-        for each in (owner, *others, server):
-            each.close()
+        for source in (owner, *others):
+            source.close()
+        server.close()
 
 
 def test_a_key_does_not_read_unencrypted_frames() -> None:

@@ -229,6 +229,7 @@ def test_mavsdk_flies_through_the_signing_proxy(key: Path) -> None:
         assert flying.autopilot.arming is Arming.ARMED
         counters = flying.server.counters()["onboard"]
         assert counters.rx > 0
+        assert link._proxy is not None
         assert (counters.refused, link._proxy.refused) == (0, 0)
 
 
@@ -332,10 +333,9 @@ def test_a_third_sender_neither_ends_a_flight_nor_hides_a_takeover(key: Path) ->
 @pytest.mark.parametrize("signed", [False, True])
 def test_of_two_vehicles_the_named_one_is_flown(signed: bool, key: Path, tmp_path: Path) -> None:
     (api,), _ = free_ports(1, 0)
-    keys = [None] * 3
-    if signed:
-        keys = [tmp_path / name for name in "012"]
-        for path in keys:
+    keys = [tmp_path / name if signed else None for name in "012"]
+    for path in keys:
+        if path is not None:
             write_key(path, KEY)
     with (
         closing(Flying(keys[0], api, 1)) as first,

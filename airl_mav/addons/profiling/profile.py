@@ -264,7 +264,8 @@ class ProfileOptions(ProfileRequest):
         airl profile --network 5x32
         airl profile --soak 10min --share my-pi.toml
         airl profile static-obstacles --level sitl
-        airl profile --level hil --connect udpin://0.0.0.0:14540 --camera tcp://192.168.1.10:5600
+        airl profile --level hil --insecure --connect udpin://0.0.0.0:14540 \
+            --camera tcp://192.168.1.10:5600
     """
 
     policy: Annotated[str | None, POSITIONAL] = Field(
