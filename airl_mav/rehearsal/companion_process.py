@@ -77,6 +77,7 @@ class MissionRunner:
                 MavsdkLink(
                     *(f"udpin://{LOOPBACK}:{aircraft.companion_port}", clock, self._abandon),
                     signing_key=aircraft.signing_key,
+                    system_id=aircraft.system_id,
                 )
             ) as link,
         ):

@@ -188,6 +188,11 @@ class Aircraft(ProfileModel):
         return self.ports.model_copy(update=by_name)
 
     @property
+    def system_id(self) -> int | None:
+        """MAVLink system id of the built-in flight controller; None = that of real firmware."""
+        return self.real.instance + 1 if self.firmware == "builtin" else None
+
+    @property
     def companion_port(self) -> int:
         """UDP port on which a companion listens for the flight controller."""
         moved = self.real.instance if self.firmware == "px4" else 0

@@ -30,6 +30,7 @@ def test_the_number_moves_ports_as_px4s_does() -> None:
     assert (moved.api_port, moved.api_local_port) == (14543, 14583)
     assert (moved.gcs_port, moved.gcs_local_port) == (14550, 18573)
     assert moved.camera_port == 5603
+    assert aircraft(3, Ports()).system_id == 4
     any_free = aircraft(3, Ports(api_local_port=0, camera_port=0)).open_ports
     assert (any_free.api_local_port, any_free.camera_port) == (0, 0)
     with pytest.raises(UsageError, match="instance <= 65535"):
