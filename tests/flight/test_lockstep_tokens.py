@@ -373,7 +373,8 @@ def test_a_companion_without_the_key_can_be_interrupted(
 def test_companion_that_dies_ends_the_flight(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:
-    ports, signed = choose_ports(), ("--signing-key", str(key))
+    keys = "--signing-key", str(key), "--camera-key", str(key)
+    ports, signed = choose_ports(), keys
     words = firmware_words(ports, "--companion-timeout", "1", "--speed", "15.0", *signed)
     with (
         running(words, tmp_path) as firmware,
