@@ -272,7 +272,7 @@ class Run:
 
     @cached_property
     def quality(self) -> statistics.Aggregate:
-        """Success rate, and means over the successful flights, each with its 95 % interval."""
+        """Success rate, and medians over the successful flights, each with its 95 % interval."""
         return statistics.aggregate(self.episodes)
 
     @cached_property

@@ -1,5 +1,9 @@
 """Flight quality over many episodes, with 95 % intervals and n; paired comparison of two runs.
 
+Times, distances and energies are medians. Their intervals cover 95 % for every continuous
+distribution. No interval of a mean does so for flight times: a sample without a rare long flight
+has no information on it. `scripts/studies/interval_coverage.py` measures the coverage.
+
 Pairing by seed removes the variation between arenas. A small difference becomes visible after far
 fewer flights than with different seeds.
 """
@@ -7,9 +11,8 @@ fewer flights than with different seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,14 +21,18 @@ from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Quality
 
+Floats = NDArray[np.float64]
+
 CONFIDENCE = 0.95
 QUANTILE = 1.959963984540054
 """Quantile of the normal distribution, for a two-sided 95 % interval:
 `scipy.special.ndtri(0.975)`."""
-NORMAL = NormalDist()
-RESAMPLES = 2000
-BOOTSTRAP_SEED = 20_210_409
-"""Fixed seed: the same episodes always give the same interval."""
+BETS = np.linspace(0.0, 1.0, 202)[1:-1]
+"""Stakes of `anytime_mean`, a uniform mixture."""
+BOUND_PRECISION = 1e-6
+"""Precision of the ends of `anytime_mean`, found by bisection."""
+BINS = 1000
+"""Values per unit to which `anytime_mean` rounds in the conservative direction."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +53,8 @@ class Estimate:
         return Estimate(value, low, high, self.n)
 
 
-MEANS = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "total_energy_j")
-"""Measures of flight quality whose means are compared between two runs."""
+COMPARED = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "total_energy_j")
+"""Measures of flight quality that are compared between two runs."""
 
 PACK_MEASURES = ("endurance_s", "range_m", "missions_per_charge")
 """Measures absent from older runs."""
@@ -56,10 +63,10 @@ SMOOTHNESS = ("jerk_rms_m_s3", "command_step_m_s")
 """Smoothness measures, absent from older runs."""
 
 OF_ALL_FLIGHTS = ("deadline_misses",)
-"""Measures averaged over all valid flights: late decisions matter most in failed flights."""
+"""Fractions averaged over all valid flights: late decisions matter most in failed flights."""
 
-AVERAGED = (*MEANS, "mean_speed_m_s", *PACK_MEASURES, *SMOOTHNESS)
-"""Measures of flight quality with a mean and a median."""
+OF_SUCCESSES = (*COMPARED, "mean_speed_m_s", *PACK_MEASURES, *SMOOTHNESS)
+"""Measures with a median over the successful flights."""
 
 NO_ESTIMATE = Estimate(None, None, None, 0)
 """Estimate without data."""
@@ -67,7 +74,7 @@ NO_ESTIMATE = Estimate(None, None, None, 0)
 
 @dataclass(frozen=True)
 class Aggregate:
-    """Figures of a run. Times, distances and energies are means over the successful episodes."""
+    """Figures of a run. Times, distances and energies are medians over the successful episodes."""
 
     success_rate: Estimate
     """Fraction, 0 to 1, over all valid episodes: an aborted one did not reach its goal."""
@@ -107,84 +114,75 @@ def wilson(successes: int, n: int) -> Estimate:
     return Estimate(rate, low, high, n)
 
 
-def bootstrap_mean(values: ArrayLike) -> Estimate:
-    """Return the mean of values (n,) with a bootstrap 95 % interval (BCa, seeded).
+def anytime_mean(values: ArrayLike, counts: ArrayLike | None = None) -> Estimate:
+    """Return the mean of values (n,) within 0 to 1, with an interval of at least 95 %.
 
-    One value has no interval. Equal values have an interval of width zero.
+    The interval holds for every distribution, and at any stopping time that depends on the values.
+    It contains the means against which no mixture of bets multiplies its stake by 40
+    (Waudby-Smith & Ramdas, Estimating means of bounded random variables by betting, JRSS B 86,
+    2024). `counts` (n,) repeat values.
     """
     data = np.asarray(values, np.float64)
-    if not data.size:
+    weights = np.ones(data.shape) if counts is None else np.asarray(counts, np.float64)
+    n = int(weights.sum())
+    if n == 0:
         return NO_ESTIMATE
-    mean = float(data.mean())
-    # One value has no spread to resample.
-    if data.size == 1:
-        return Estimate(mean, None, None, 1)
-    # The bias correction is undefined without spread.
-    if np.ptp(data) == 0.0:
-        return Estimate(mean, mean, mean, data.size)
-    return Estimate(mean, *bootstrap_interval((data,), lambda means: means), data.size)
+    low, high = _betting_bound(data, weights), 1.0 - _betting_bound(1.0 - data, weights)
+    return Estimate(float(np.average(data, weights=weights)), low, high, n)
 
 
-def bootstrap_interval(
-    samples: Sequence[NDArray[np.float64]], statistic: Callable[..., NDArray[np.float64]]
-) -> tuple[float, float]:
-    """Return the seeded 95 % bootstrap interval of a function of means.
-
-    Bias-corrected and accelerated: Efron & Tibshirani, An Introduction to the Bootstrap, 1993,
-    section 14.3. Equal to `scipy.stats.bootstrap`, whose import takes two seconds of processor
-    time, with memory proportional to n instead of its square. The samples are paired and not all
-    equal, each (n,), n >= 2; `statistic` takes the means (k,) of each.
-    """
-    n = samples[0].size
-    # The same indices for all samples keep pairs together; the seed makes reports reproducible.
-    draws = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (RESAMPLES, n))
-    resampled = statistic(*(sample[draws].mean(axis=-1) for sample in samples))
-    observed = statistic(*(sample.mean(keepdims=True) for sample in samples))
-    # Jackknife means in closed form: O(n) memory.
-    without_one = statistic(*((sample.sum() - sample) / (n - 1) for sample in samples))
-    # Ties count half: discrete data have many of them.
-    below = 0.5 * (np.mean(resampled < observed) + np.mean(resampled <= observed))
-    # Limited to half a resample: the quantile of 0 or 1 is infinite.
-    bias = NORMAL.inv_cdf(min(max(float(below), 0.5 / RESAMPLES), 1.0 - 0.5 / RESAMPLES))
-    influence = without_one.mean() - without_one
-    spread = float((influence**2).sum()) ** 1.5
-    acceleration = float((influence**3).sum()) / (6.0 * spread) if spread else 0.0
-
-    def end(quantile: float) -> float:
-        shifted = bias + quantile
-        share = NORMAL.cdf(bias + shifted / (1.0 - acceleration * shifted))
-        return float(np.quantile(resampled, share))
-
-    return end(-QUANTILE), end(QUANTILE)
+def _betting_bound(values: Floats, weights: Floats) -> float:
+    """Return the lower bound of a mean within 0 to 1."""
+    # The tolerance keeps multiples of a bin in their bin.
+    binned = np.floor(values * BINS + 1e-6) / BINS
+    value, inverse = np.unique(binned, return_inverse=True)
+    count = np.bincount(inverse, weights)
+    inside, outside = float(np.average(value, weights=count)), 0.0
+    limit = math.log(2.0 / (1.0 - CONFIDENCE))
+    # The capital falls with the assumed mean, so the bound is found by bisection.
+    while inside - outside > BOUND_PRECISION:
+        mean = 0.5 * (inside + outside)
+        wealth = np.log1p(np.multiply.outer(BETS, value / mean - 1.0)) @ count
+        if np.logaddexp.reduce(wealth) - math.log(BETS.size) < limit:
+            inside = mean
+        else:
+            outside = mean
+    return outside
 
 
 def median_of(values: ArrayLike) -> Estimate:
     """Return the median of values (n,) with a distribution-free 95 % interval.
 
-    The interval ends at two of the values. The number of values below the true median is binomial
-    (Conover, Practical Nonparametric Statistics, 3rd ed., 1999, section 3.2). Fewer than six values
-    have no interval.
+    The number of values below the true median is binomial, so intervals that end at two of the
+    values have only certain coverages. Each end is interpolated between the two values around 95 %
+    (Hettmansperger & Sheather, Confidence intervals based on interpolated order statistics,
+    Statistics & Probability Letters 4, 1986). Fewer than six values have no interval.
     """
     data = np.sort(np.asarray(values, np.float64))
     n = data.size
     if not n:
         return NO_ESTIMATE
-    # Maximum number of values that may be left out on either side.
-    # Two-sided: half of the error probability on each side.
-    out = _binomial_quantile(0.5 * (1.0 - CONFIDENCE), n) - 1
+    cumulative = _coin_tosses(n)
+    # Number of values beyond the narrowest interval of order statistics that covers 95 %.
+    beyond = int(np.searchsorted(cumulative, 0.5 * (1.0 - CONFIDENCE))) - 1
     middle = float(np.median(data))
-    if out < 0:
+    if beyond < 0:
         return Estimate(middle, None, None, n)
-    return Estimate(middle, float(data[out]), float(data[n - 1 - out]), n)
+    wide, narrow = (1.0 - 2.0 * cumulative[k] for k in (beyond, beyond + 1))
+    share, k = (wide - CONFIDENCE) / (wide - narrow), beyond + 1
+    weight = (n - k) * share / (k + (n - 2 * k) * share)
+    low = data[beyond] + weight * (data[k] - data[beyond])
+    high = data[n - k] - weight * (data[n - k] - data[n - k - 1])
+    return Estimate(middle, float(low), float(high), n)
 
 
-def _binomial_quantile(probability: float, n: int) -> int:
-    """Return the minimum number of heads in n coin tosses with this cumulative probability."""
+def _coin_tosses(n: int) -> Floats:
+    """Return the cumulative probabilities (n + 1,) of heads in n coin tosses."""
     heads = np.arange(n)
     steps = np.log(n - heads) - np.log1p(heads)
     # Logarithms, because the binomial coefficients overflow beyond about 1000 values.
     logarithms = np.concatenate([[0.0], np.cumsum(steps)]) - n * math.log(2.0)
-    return int(np.searchsorted(np.cumsum(np.exp(logarithms)), probability))
+    return np.cumsum(np.exp(logarithms))
 
 
 def reached_goals(episodes: Sequence[EpisodeRecord]) -> list[bool]:
@@ -206,8 +204,8 @@ def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     return Aggregate(
         success_rate=wilson(sum(reached), len(reached)),
         outcomes=outcomes,
-        **{name: bootstrap_mean(known(good, name)) for name in AVERAGED},
-        **{name: bootstrap_mean(known(qualities, name)) for name in OF_ALL_FLIGHTS},
+        **{name: median_of(known(good, name)) for name in OF_SUCCESSES},
+        **{name: anytime_mean(known(qualities, name)) for name in OF_ALL_FLIGHTS},
     )
 
 
@@ -221,16 +219,11 @@ def known(good: Sequence[Quality], name: str) -> list[float]:
     return [value for quality in good if (value := getattr(quality, name)) is not None]
 
 
-Floats = NDArray[np.float64]
-
 Pair = tuple[EpisodeRecord, EpisodeRecord]
 """Flights of one seed: reference, other."""
 
 TANGO_PRECISION = 1e-12
 """Precision of the ends of Tango's interval, found by bisection."""
-
-SAME_RATIO = 1e-12
-"""Maximum difference between ratios that is attributed to rounding."""
 
 
 @dataclass(frozen=True)
@@ -255,18 +248,17 @@ class Change:
     reference: float | None
     other: float | None
     difference: Estimate
-    """Other minus reference; its n is the number of pairs behind all three figures."""
-    median: Estimate | None = None
-    """Median over the pairs of each pair's difference [%]. One long flight moves a mean, but not a
-    median. None for the success rate."""
+    """Median over the pairs of each pair's difference [%]; for the success rate, other minus
+    reference. Its n is the number of pairs behind all three figures."""
 
 
 @dataclass(frozen=True)
 class PairedComparison:
     """Comparison of a run with a reference, over pairs of flights with the same seed.
 
-    The difference of a mean is `100 (other - reference) / reference` percent, over the common
-    successes. The difference of the success rate is in percentage points, over all pairs.
+    Figures of both runs are medians over the common successes. Their difference is the median of
+    `100 (other - reference) / reference` percent over the pairs. The difference of the success rate
+    is in percentage points, over all pairs.
     """
 
     agreement: Agreement
@@ -369,32 +361,20 @@ def _score(d: float, gained: int, lost: int, n: int) -> float:
     return away / math.sqrt(variance) if variance > 0.0 else math.copysign(math.inf, away)
 
 
-def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
-    """Return the relative difference of paired means [%], with a bootstrap 95 % interval.
+def anytime_gap(agreement: Agreement) -> Estimate:
+    """Return the difference of two paired success rates [points], valid at any stop.
 
-    Resamples whole pairs (n,) (BCa, seeded). One pair has no interval. Pairs of equal ratio have an
-    interval of width zero. Raises ValueError unless all values of the reference are > 0.
+    For flights that are added until a decision: see `anytime_mean`. It excludes zero exactly if a
+    mixture of bets on the discordant pairs multiplies its stake by 40 (the e-process of McNemar's
+    test).
     """
-    first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
-    if first.ndim != 1 or first.shape != second.shape:
-        raise ValueError(f"shapes {first.shape} and {second.shape}: must be (n,), the same")
-    if not (first > 0.0).all():
-        raise ValueError("reference: must be > 0")
-    n = first.size
-    if n == 0:
+    gained, lost, n = agreement.only_other, agreement.only_reference, agreement.n
+    found = anytime_mean([0.0, 0.5, 1.0], [lost, n - gained - lost, gained])
+    if found.low is None or found.high is None:
         return NO_ESTIMATE
-    value = percent_change(float(first.mean()), float(second.mean()))
-    # One pair has a difference, but no interval.
-    if n == 1:
-        return Estimate(value, None, None, 1)
-    # Equal ratios up to rounding: resampling would amplify rounding errors.
-    if np.ptp(second / first) <= SAME_RATIO:
-        return Estimate(value, value, value, n)
-    return Estimate(value, *bootstrap_interval((first, second), _percent), n)
-
-
-def _percent(reference: Floats, other: Floats) -> Floats:
-    return 100.0 * (other - reference) / reference
+    # Of the pairs' differences: -1 for a loss, +1 for a gain.
+    low, high = 2.0 * found.low - 1.0, 2.0 * found.high - 1.0
+    return Estimate((gained - lost) / n, low, high, n).scaled(100.0)
 
 
 def compare_pairs(
@@ -407,7 +387,7 @@ def compare_pairs(
     return PairedComparison(
         agreement=agreement,
         success_rate=_compare_rates(agreement),
-        **{name: compare_means(*_known_by_both(good, name)) for name in MEANS},
+        **{name: compare_medians(*_known_by_both(good, name)) for name in COMPARED},
     )
 
 
@@ -416,7 +396,7 @@ def _known_by_both(
 ) -> tuple[list[float], list[float]]:
     """Return a measure of the pairs in which both flights have it."""
     values = [(getattr(first, name), getattr(second, name)) for first, second in good]
-    # A pair counts only if both flights have the measure; otherwise means would compare different
+    # A pair counts only if both flights have the measure; otherwise medians would compare different
     # seeds.
     both = [pair for pair in values if None not in pair]
     return [first for first, _ in both], [second for _, second in both]
@@ -435,18 +415,17 @@ def _compare_rates(agreement: Agreement) -> Change:
     )
 
 
-def compare_means(reference: ArrayLike, other: ArrayLike) -> Change:
-    """Return the difference of the means of paired values (n,) [%], and the median over the pairs.
+def compare_medians(reference: ArrayLike, other: ArrayLike) -> Change:
+    """Return the medians of paired values (n,), and the median over the pairs' differences [%].
 
     The difference is undefined if a reference value is 0, as for a computer of 0 W.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if not first.size:
-        return Change(None, None, NO_ESTIMATE, NO_ESTIMATE)
-    means = float(first.mean()), float(second.mean())
-    if not (first > 0.0).all():
-        return Change(*means, NO_ESTIMATE, NO_ESTIMATE)
-    return Change(*means, relative_difference(first, second), median_ratio(first, second))
+        return Change(None, None, NO_ESTIMATE)
+    defined = bool((first > 0.0).all())
+    difference = median_ratio(first, second) if defined else NO_ESTIMATE
+    return Change(float(np.median(first)), float(np.median(second)), difference)
 
 
 def median_ratio(reference: ArrayLike, other: ArrayLike) -> Estimate:

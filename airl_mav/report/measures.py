@@ -34,9 +34,6 @@ from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun, vehicle_of
 from airl_mav.report.document import NONE, TOO_FEW_CELL, TableView, columns_of, with_interval
 
-FEW_FLIGHTS = 10
-"""Number of flights below which a bootstrap interval covers clearly less than 95 %."""
-
 MANY_FLIGHTS = 100
 """Number of flights from which rates have a decimal."""
 
@@ -69,6 +66,11 @@ class QualityMeasure:
     """Factor from the unit of the field to the displayed unit."""
     digits: int
     difference_unit: str = "%"
+
+    @property
+    def headline(self) -> str:
+        """Title of the measure as a headline: a rate, or a median."""
+        return self.title if self.difference_unit == "points" else f"{self.title}, median"
 
     def of(self, quality: Aggregate) -> Estimate:
         """Return the measure of a run."""
@@ -148,8 +150,8 @@ class RunSummary:
     samples: dict[str, Samples]
     """Raw durations of the stages [µs]."""
     quality: statistics.Aggregate
-    medians: dict[str, statistics.Estimate]
-    """Medians over the flights of `quality`, by its fields."""
+    means: dict[str, float]
+    """Means over the flights of `quality`, by its fields."""
     modelled: bool
     """True if times come from a model instead of measurements: level gym."""
     timed: bool
@@ -172,8 +174,10 @@ def summarize_run(run: LoadedRun) -> RunSummary:
         stages=stages,
         samples=samples,
         quality=statistics.aggregate(run.episodes),
-        medians={
-            name: statistics.median_of(statistics.known(good, name)) for name in statistics.AVERAGED
+        means={
+            name: float(np.mean(values))
+            for name in statistics.OF_SUCCESSES
+            if (values := statistics.known(good, name))
         },
         modelled=run.info.setup.level == "gym",
         timed=run.info.setup.level not in ("gym", "lockstep"),
@@ -182,7 +186,8 @@ def summarize_run(run: LoadedRun) -> RunSummary:
 
 CONDUCT_NOTE = (
     "Deadline misses: decisions that took effect later than the hold time after their frame was "
-    "exposed, or never; of all valid flights, the rest of those that reached the goal. Jerk: "
+    "exposed, or never; the mean of all valid flights, with an interval of at least 95 %. The "
+    "rest: medians of the flights that reached the goal. Jerk: "
     f"sampled at 50 Hz, Gaussian low-pass of {trajectory.BANDWIDTH_HZ:g} Hz; that of the command "
     "is its steps seen through the same filter."
 )
@@ -235,19 +240,20 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
         return None
     reached = [e for e in run.episodes if e.outcome is judge.Outcome.SUCCESS and not e.invalid]
     good = successful(reached)
-    command_rms = known(good, "command_jerk_rms_m_s3")
+    command_rms = statistics.median_of(known(good, "command_jerk_rms_m_s3"))
     steps = np.concatenate(
         [np.zeros(0), *(trajectory.command_steps(run.latency.get(e.index, {})) for e in reached)]
     )
     p95, n = percentile(steps, 95.0), f"{steps.size:,}"
     tail = f"{p95:.2f} m/s" if p95 is not None else TOO_FEW_CELL if steps.size else NONE
     greatest_step = f"{steps.max():.2f} m/s" if steps.size else NONE
-    rms = f"{np.mean(command_rms):,.2f} m/s³" if command_rms else NONE
 
-    def mean(measure: QualityMeasure) -> tuple[str, ...]:
-        of = measure.of(q)
+    def row(
+        measure: QualityMeasure, title: str = "", estimate: Estimate | None = None
+    ) -> tuple[str, ...]:
+        of = estimate or measure.of(q)
         value = measure.plain(of.value, unit=True)
-        return measure.title, value, measure.interval(of), f"{of.n:,}"
+        return title or measure.title, value, measure.interval(of), f"{of.n:,}"
 
     def greatest(title: str, name: str) -> tuple[str, ...]:
         peaks = known(good, name)
@@ -256,13 +262,13 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
 
     budget = _budget(run)
     rows = (
-        mean(DEADLINE_MISSES),
+        row(DEADLINE_MISSES),
         *(() if budget is None else (budget.row(summary.samples["t2"]),)),
-        mean(JERK),
+        row(JERK),
         greatest("jerk, flown, peak", "jerk_peak_m_s3"),
-        ("jerk, commanded, RMS", rms, NONE, f"{len(command_rms):,}"),
+        row(JERK, "jerk, commanded, RMS", command_rms),
         greatest("jerk, commanded, peak", "command_jerk_peak_m_s3"),
-        mean(COMMAND_STEP),
+        row(COMMAND_STEP),
         ("step of the command, p95", tail, NONE, n),
         ("step of the command, greatest", greatest_step, NONE, n),
     )

@@ -461,9 +461,9 @@ def run_headlines(run: LoadedRun, summary: RunSummary) -> list[document.Headline
             document.estimate_headline(title, estimate.scaled(scale), unit, digits=digits)
             for title, estimate, scale, unit, digits in (
                 ("success rate", q.success_rate, 100.0, "%", rate_digits(q.success_rate)),
-                ("flight time", q.flight_time_s, 1.0, "s", 1),
-                ("distance", q.distance_m, 1.0, "m", 1),
-                ("energy", q.energy_j, 1e-3, "kJ", 1),
+                ("flight time, median", q.flight_time_s, 1.0, "s", 1),
+                ("distance, median", q.distance_m, 1.0, "m", 1),
+                ("energy, median", q.energy_j, 1e-3, "kJ", 1),
             )
         ),
         document.Headline("t2, median", ms(t2.p50, 1), "ms", f"{origin}, n = {t2.n:,}"),

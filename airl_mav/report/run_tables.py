@@ -16,7 +16,6 @@ from airl_mav.core import constants, resource_use
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.statistics import NO_ESTIMATE
 from airl_mav.latency.stages import CommandAges, Summary, command_ages, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
@@ -26,7 +25,6 @@ from airl_mav.report.measures import (
     COMPUTER_ENERGY,
     DISTANCE,
     ENERGY,
-    FEW_FLIGHTS,
     FLIGHT_TIME,
     MEAN_SPEED,
     PACK,
@@ -154,7 +152,7 @@ def _kilojoules(joules: float | None) -> str:
 
 def quality_table(summary: RunSummary, *, computer: bool = True) -> document.TableView:
     """Return the flight quality with intervals; `computer` adds the row of its energy."""
-    columns = document.columns_of("<measure | value | 95 % interval | median | *95 % interval | n")
+    columns = document.columns_of("<measure | value | 95 % interval | *mean | n")
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
     measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY]
@@ -164,22 +162,18 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> document.Tab
     measures += [measure for measure in PACK if measure.of(q).n]
     rows = []
     for measure in measures:
-        mean, median = measure.of(q), summary.medians.get(measure.key, NO_ESTIMATE)
-        value, middle = measure.plain(mean.value, unit=True), measure.plain(median.value)
-        intervals = measure.interval(mean), measure.interval(median)
-        rows.append((measure.title, value, intervals[0], middle, intervals[1], f"{mean.n}"))
+        estimate, mean = measure.of(q), measure.plain(summary.means.get(measure.key))
+        value, interval = measure.plain(estimate.value, unit=True), measure.interval(estimate)
+        rows.append((measure.title, value, interval, mean, f"{estimate.n}"))
     notes = [
-        "Means and medians over the flights that reached the goal; n is their number (for the "
-        "success rate: all valid flights). Intervals: Wilson for the rate, bootstrap "
-        "for the means, binomial for the medians."
+        "Medians over the flights that reached the goal; n is their number (for the success rate: "
+        "all valid flights). Intervals: Wilson for the rate, order statistics for the medians."
     ]
     if q.endurance_s.n:
         notes.append(
             "Endurance, range and missions: the whole charge at the start, at the mean power and "
             "speed of each flight with its computer, take-off and landing left out."
         )
-    if 1 < q.flight_time_s.n < FEW_FLIGHTS:
-        notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
     return document.TableView("quality", "Quality of flight", columns, tuple(rows), tuple(notes))
 
 

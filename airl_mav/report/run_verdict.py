@@ -172,8 +172,8 @@ def _gap_words(against: PairedComparison, reference: str) -> str:
         told.append(f"{abs(rate.value):.1f} points {word}{_interval(rate)}")
     if time.value is not None:
         word = "less" if time.value < 0.0 else "more"
-        told.append(f"{abs(time.value):.1f} % {word} flight time{_interval(time)}")
-    return f"; {' and '.join(told)} than on {reference}" if told else ""
+        told.append(f"a median {abs(time.value):.1f} % {word} flight time{_interval(time)}")
+    return f"; {' and '.join(told)} than {reference}" if told else ""
 
 
 def _percent(estimate: Estimate) -> str:

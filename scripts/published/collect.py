@@ -18,7 +18,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
 from airl_mav.experiments.experiment import load_run
-from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
+from airl_mav.flight.statistics import Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.comparison_model import Comparison, load_comparison
 from airl_mav.report.document import SCHEMA, TABLE_FILE
@@ -240,7 +240,6 @@ def _gaps(comparison: Comparison, prefix: str) -> Iterator[tuple[str, Gap]]:
             Gap(
                 target=prefix + entry.target,
                 reference=prefix + entry.reference,
-                median_flight_time=Figure.of(paired.flight_time_s.median or NO_ESTIMATE),
                 t2_percent=contrast.t2_percent,
                 **{m: Figure.of(getattr(paired, m).difference) for m in MEASURES},
             ),

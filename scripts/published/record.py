@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -73,10 +74,9 @@ class Gap(ProfileModel):
     target: str = Field(description="name of the run")
     reference: str
     success_rate: Figure = Field(description="percentage points, Tango's interval")
-    flight_time_s: Figure = Field(description="this and the following: percent, common successes")
-    distance_m: Figure
+    flight_time_s: Figure = Field(description="percent, median over the common successes")
+    distance_m: Figure = Field(description="this and the following: as the record's averages")
     energy_j: Figure
-    median_flight_time: Figure = Field(description="median over the pairs [%]")
     t2_percent: float | None = Field(description="of the mean t2 of all decisions, not paired")
 
 
@@ -117,6 +117,11 @@ class Record(ProfileModel):
     name: str
     what: str = Field(description="one line for people")
     made: Made
+    averages: Literal["medians", "means"] = Field(
+        default="medians",
+        description="kind of times, distances and energies; means of older results have no"
+        " interval, and their paired flight times are medians",
+    )
     runs: dict[str, FlownRun] = Field(default_factory=dict)
     gaps: dict[str, Gap] = Field(default_factory=dict)
     printed: Printed | None = None

@@ -54,9 +54,10 @@ def _success(run: FlownRun) -> str:
 
 
 def _costs(gap: Gap) -> str:
-    """Return the relative changes of time, distance and energy."""
-    figures = {"time": gap.flight_time_s, "distance": gap.distance_m, "energy": gap.energy_j}
-    return ", ".join(f"{name} {number(figure, 0, '+')} %" for name, figure in figures.items())
+    """Return the relative changes of time, with its interval, of distance and of energy."""
+    figures = {"distance": gap.distance_m, "energy": gap.energy_j}
+    rest = (f"{name} {number(figure, 0, '+')} %" for name, figure in figures.items())
+    return ", ".join((f"time {percent(gap.flight_time_s)}", *rest))
 
 
 def _changes(gap: Gap) -> tuple[str, ...]:

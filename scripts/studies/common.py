@@ -23,7 +23,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.flight.episode_record import EpisodeRecord
-from airl_mav.flight.statistics import Estimate, bootstrap_mean
+from airl_mav.flight.statistics import Estimate, median_of
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.loading import list_profiles, read_toml
@@ -115,7 +115,7 @@ def fly(
     code, flown = fly_and_show(one, root / "one-goal", console)
     for run in flown.cells:
         paths = flown.runs[run.cell.name].trajectories
-        wide = bootstrap_mean([aside(paths[e.index], e) for e in run.episodes if e.index in paths])
+        wide = median_of([aside(paths[e.index], e) for e in run.episodes if e.index in paths])
         console.print(f"widest aside {with_interval(wide, 2)} m: {run.cell.title}", soft_wrap=True)
     return code
 

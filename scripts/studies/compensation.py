@@ -32,7 +32,7 @@ from airl_mav.core.progress import new_console
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
-from airl_mav.flight.statistics import relative_difference, wilson
+from airl_mav.flight.statistics import median_ratio, wilson
 from airl_mav.prediction import RECENT, Compensator, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.document import (
@@ -169,7 +169,7 @@ def cells(flown: dict[int, EpisodeResult], reference: dict[int, EpisodeResult]) 
         for seed, flight in flown.items()
         if flight.verdict == reference[seed].verdict == FlightStatus.SUCCESS
     ]
-    longer = relative_difference(
+    longer = median_ratio(
         [reference[seed].flight_time_s for seed in both],
         [flown[seed].flight_time_s for seed in both],
     )

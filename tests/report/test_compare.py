@@ -82,7 +82,7 @@ def lines(path: Path) -> dict[int, dict[str, Any]]:
 
 def test_differences_are_those_of_the_files(runs: dict[str, Path], page: Path) -> None:
     data = json.loads((page.parent / "compare.json").read_text())
-    assert data["schema"] == 2
+    assert data["schema"] == 3
     first, second = lines(runs["fast"]), lines(runs["slow"])
     found = data["contrasts"][0]["paired"]
     reached = [(first[s]["outcome"] == "success", second[s]["outcome"] == "success") for s in first]
@@ -97,8 +97,8 @@ def test_differences_are_those_of_the_files(runs: dict[str, Path], page: Path) -
     assert difference["low"] == pytest.approx(100.0 * (tango(gained, lost, EPISODES).low or 0.0))
     common = [s for s, ends in zip(first, reached, strict=True) if all(ends)]
     for key in ("flight_time_s", "distance_m", "energy_j"):
-        a, b = (np.mean([e[s]["quality"][key] for s in common]) for e in (first, second))
-        assert found[key]["difference"]["value"] == pytest.approx(100.0 * (b / a - 1.0))
+        a, b = (np.array([e[s]["quality"][key] for s in common]) for e in (first, second))
+        assert found[key]["difference"]["value"] == pytest.approx(100.0 * np.median(b / a - 1.0))
         assert found[key]["difference"]["n"] == len(common)
 
 
@@ -270,10 +270,10 @@ def test_a_table_of_policies_and_arenas_stands_for_its_runs(
     for name in ("fast", "slow"):
         (root / name).symlink_to(runs[name])
     entries = [{"entry": {"name": name, "folder": name}} for name in ("fast", "slow")]
-    held = {"schema": 2, "facts": {}, "runs": entries}
+    held = {"schema": 3, "facts": {}, "runs": entries}
     (root / "matrix.json").write_text(json.dumps(held))
     assert "workstation" in ask(root, out=tmp_path / "out")
-    (root / "matrix.json").write_text('{"schema": 2, "runs": 3}')
+    (root / "matrix.json").write_text('{"schema": 3, "runs": 3}')
     with pytest.raises(UsageError, match=r"matrix\.json: facts: missing"):
         ask(root, runs["fast"], out=tmp_path / "other")
 

@@ -221,13 +221,16 @@ def test_differences_are_those_of_the_files(whole: tuple[Path, str], level: str)
     assert difference["n"] == len(seeds)
     common = [s for s, ends in zip(seeds, reached, strict=True) if all(ends)]
     for key in ("flight_time_s", "distance_m", "energy_j"):
-        first = np.mean([gym[s]["quality"][key] for s in common])
-        second = np.mean([other[s]["quality"][key] for s in common])
-        assert found[key]["reference"] == pytest.approx(first)
-        assert found[key]["other"] == pytest.approx(second)
+        first = np.array([gym[s]["quality"][key] for s in common])
+        second = np.array([other[s]["quality"][key] for s in common])
+        assert found[key]["reference"] == pytest.approx(np.median(first))
+        assert found[key]["other"] == pytest.approx(np.median(second))
         difference = found[key]["difference"]
-        assert difference["value"] == pytest.approx(100.0 * (second / first - 1.0))
-        assert difference["low"] < difference["value"] < difference["high"]
+        assert difference["value"] == pytest.approx(100.0 * np.median(second / first - 1.0))
+        if len(common) >= 6:
+            assert difference["low"] < difference["value"] < difference["high"]
+        else:
+            assert difference["low"] is difference["high"] is None
         assert difference["n"] == len(common)
 
 
@@ -300,18 +303,12 @@ def test_no_difference_is_printed_without_its_pairs(whole: tuple[Path, str]) -> 
     for view, contrast in zip(comparison_tables(compared), compared.contrasts, strict=True):
         agreement = contrast.paired.agreement
         titles = [column.title for column in view.columns]
-        assert titles[-4:] == ["difference", "95 % interval", "median of pairs", "pairs"]
+        assert titles[-3:] == ["difference", "95 % interval", "pairs"]
         pairs = [agreement.n] + 3 * [agreement.both]
         assert [int(row[-1]) for row in view.rows] == pairs
         for row in view.rows:
-            shown = (*row[:-2], row[-1])
-            assert re.search(r"\s+".join(map(re.escape, shown)), text), row
+            assert re.search(r"\s+".join(map(re.escape, row)), text), row
         assert f"only gym in {agreement.only_reference}" in view.notes[0]
-    few = "Bootstrap intervals of fewer than 10 pairs are too narrow."
-    lockstep, sitl = comparison_tables(compared)
-    assert compared.contrasts[0].paired.agreement.both >= 10
-    assert few not in lockstep.notes
-    assert few in sitl.notes
     assert any("Not the same number" in note for note in runs_table(compared.runs).notes)
 
 
@@ -459,7 +456,7 @@ def test_figures_say_what_the_tables_say(whole: tuple[Path, str]) -> None:
 def test_a_bar_lies_where_its_interval_is(whole: tuple[Path, str]) -> None:
     """The bar of the figure, in pixels, against the numbers on its axis."""
     compared = read_levels(whole[0])
-    picture = contrast_pictures("x", compared, compared.contrasts)[1]
+    picture = contrast_pictures("x", compared, compared.contrasts)[0]
     with Image.open(io.BytesIO(picture.png)) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     blue = np.abs(pixels - (0x28, 0x68, 0xA8)).sum(axis=2) < 30
@@ -472,7 +469,7 @@ def test_a_bar_lies_where_its_interval_is(whole: tuple[Path, str]) -> None:
     ends = [np.flatnonzero(blue[row])[[0, -1]] - zero.mean() for row in (lockstep_row, sitl_row)]
     limits = [
         (d.low or 0.0, d.high or 0.0)
-        for d in (c.paired.flight_time_s.difference for c in compared.contrasts)
+        for d in (c.paired.success_rate.difference for c in compared.contrasts)
     ]
     # One scale for all of it: pixels a percent.
     scale = np.ptp(ends[0]) / np.ptp(limits[0])
@@ -504,7 +501,7 @@ def test_a_level_without_any_success_still_has_a_page(
     entries = [RunEntry(n, n, planned=1) for n in ("lockstep", "sitl")]
     compared, loaded = build_comparison(tmp_path, "compare-levels", {}, entries)
     rows = comparison_tables(compared)[0].rows[1:]
-    assert [row[3:] for row in rows] == [("–", "–", "–", "0")] * 3
+    assert [row[3:] for row in rows] == [("–", "–", "0")] * 3
     page = write_comparison(compared, loaded, tmp_path)
     assert "n = 0" in Page(page.read_text(encoding="utf-8")).text
 
@@ -522,13 +519,13 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     ("content", "named"),
     [
         ("{", "not JSON"),
-        ('{"schema": 99}', "schema = 99: accepted: 2"),
+        ('{"schema": 99}', "schema = 99: accepted: 3"),
         (
-            '{"schema": 2, "facts": {}, "runs": [{"entry": {"name": "gym"}}]}',
+            '{"schema": 3, "facts": {}, "runs": [{"entry": {"name": "gym"}}]}',
             "folder: missing",
         ),
         (
-            '{"schema": 2, "facts": {}, "runs": [{"entry": {"name": "gym", "folder": "gym"}}]}',
+            '{"schema": 3, "facts": {}, "runs": [{"entry": {"name": "gym", "folder": "gym"}}]}',
             "no run here",
         ),
     ],

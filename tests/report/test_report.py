@@ -311,7 +311,8 @@ def test_tables_have_medians_and_their_intervals(
     run, _ = demo
     good = [e.quality for e in run.episodes if e.outcome is Outcome.SUCCESS and e.quality]
     row = cells(quality_table(summarize_run(run)), "distance")
-    assert row["median"] == f"{np.median([q.distance_m for q in good]):.2f}"
+    assert row["value"] == f"{np.median([q.distance_m for q in good]):.2f} m"
+    assert row["mean"] == f"{np.mean([q.distance_m for q in good]):.2f}"
 
 
 def test_the_energy_table_adds_up(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:

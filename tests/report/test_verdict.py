@@ -98,12 +98,12 @@ def test_a_reference_is_told_of() -> None:
         target,
         [parse_requirement("flight_time gap <= 10 %")],
         compare_pairs(reference, target),
-        "workstation",
+        "mine on workstation",
     )
     assert "13.0 points fewer [" in verdict.sentences[0]
-    # 2 s of a mean of 8.03 s.
+    # 2 s of 8.03 s.
     assert "24.9 % more flight time [" in verdict.sentences[0]
-    assert verdict.sentences[0].endswith("than on workstation.")
+    assert verdict.sentences[0].endswith("than mine on workstation.")
     assert verdict.status == "not met"
 
 

@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from airl_mav.flight.statistics import median_of
 from airl_mav.latency.stages import FENCE_SAMPLES, decision_series, fence, stage_samples
 from airl_mav.latency.stamps import NO_STAMP
 
@@ -68,21 +65,3 @@ def test_few_or_equal_durations_have_no_outliers() -> None:
     same = fence(np.full(100, 5_000))
     assert same is not None
     assert same.beyond == 0
-
-
-@pytest.mark.parametrize("n", [1, 2, 5, 6, 7, 20, 21, 100, 1001])
-def test_the_medians_interval_is_scipys(n: int) -> None:
-    values = np.random.default_rng(n).gamma(2.0, 3.0, n)
-    mine = median_of(values)
-    theirs: Any = stats.quantile_test(values, q=0.0, p=0.5).confidence_interval(0.95)
-    assert mine.value == np.median(values)
-    assert mine.n == n
-    if np.isnan(theirs.low):
-        assert mine.low is None
-        assert mine.high is None
-    else:
-        assert (mine.low, mine.high) == (theirs.low, theirs.high)
-
-
-def test_nothing_has_no_median() -> None:
-    assert median_of([]).value is None

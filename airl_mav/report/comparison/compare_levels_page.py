@@ -137,7 +137,7 @@ def _start_sentence(run: ComparedRun) -> str | None:
 
 
 def _pace_sentence(comparison: Comparison, contrast: Contrast) -> str:
-    """Return mean speed and power of both runs on common successes; empty without any."""
+    """Return speed and power of both median flights on common successes; empty without any."""
     p = contrast.paired
     time, distance, energy = p.flight_time_s, p.distance_m, p.energy_j
     parts = [
@@ -150,7 +150,8 @@ def _pace_sentence(comparison: Comparison, contrast: Contrast) -> str:
     ]
     if not parts:
         return ""
-    return f"Speed and power on {count_successes(contrast.successes)}: {'; '.join(parts)}."
+    pairs = count_successes(contrast.successes)
+    return f"Speed and power of the median flight on {pairs}: {'; '.join(parts)}."
 
 
 def _widest_sentence(comparison: Comparison, contrast: Contrast) -> str:

@@ -15,11 +15,14 @@ from airl_mav.profiles.loading import PublishedGap, PublishedRun
 
 T = TypeVar("T")
 
-SCHEMA = 2
+SCHEMA = 3
 """Schema version of a comparison's files, described in docs/reference/run-folder.md."""
 
 Kind = Literal["compare", "hardware-gap", "compare-levels", "matrix", "latency-sweep"]
 """Kind of comparison and stem of its files: `matrix.json`, `matrix.html`, `matrix.md`."""
+
+FLOWN_UNTIL = "flown_until"
+"""Fact of a comparison with a sequential test, whose flights stop at a decision."""
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
@@ -179,6 +182,11 @@ class Comparison:
     extra: dict[str, Any] = field(default_factory=dict)
     """Data of this kind only: worst seeds by group, seeds with different outcomes, ..."""
     schema: int = SCHEMA
+
+    @property
+    def stopped(self) -> bool:
+        """True if a sequential test ended the flights."""
+        return FLOWN_UNTIL in self.facts
 
     @property
     def groups(self) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ Runs = Mapping[str, LoadedRun]
 
 
 def contrast_pictures(
-    prefix: str, comparison: Comparison, contrasts: Sequence[Contrast], *, medians: bool = False
+    prefix: str, comparison: Comparison, contrasts: Sequence[Contrast]
 ) -> list[theme.FigureImage]:
     """Draw contrasts with intervals and published values, one picture per measure."""
     names = [contrast_head(comparison, each) for each in contrasts]
@@ -52,12 +52,6 @@ def contrast_pictures(
             if (told := published_change(contrast, measure)) is not None:
                 ends.append(told)
                 ax.plot(told, row, "x", ms=6, mew=1.6, color=theme.MARK, zorder=2)
-            median = change.median
-            if medians and median is not None and median.value is not None:
-                ends.append(median.value)
-                ax.plot(
-                    median.value, row, "D", ms=5, color="none", mec=theme.SERIES, mew=1.1, zorder=3
-                )
             ends += _draw_estimate(ax, row, change.difference)
         _finish_rows(ax, names, ends)
         unit = "percentage points" if measure.difference_unit == "points" else "%"
@@ -157,7 +151,7 @@ def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def energy_picture(comparison: Comparison) -> theme.FigureImage:
-    """Draw the mean energy of a successful flight, split into airframe and computer."""
+    """Draw the median energy of a successful flight, split into airframe and computer."""
     runs = [run for run in comparison.runs if run.quality.energy_j.value is not None]
     figure = theme.new_figure(6.4, 1.3 + 0.55 * len(runs))
     ax: Axes = figure.subplots()
@@ -184,7 +178,7 @@ def energy_picture(comparison: Comparison) -> theme.FigureImage:
     ax.set_ylim(len(runs) - 0.5, -0.5)
     widest = max((a + c for a, c in zip(airframe, computer, strict=True)), default=1.0)
     ax.set_xlim(0.0, 1.55 * widest)
-    theme.label_axes(ax, "mean energy of a flight that reached the goal [kJ]")
+    theme.label_axes(ax, "median energy of a flight that reached the goal [kJ]")
     theme.plain_axes(ax)
     ax.grid(False, axis="y")
     ax.tick_params(axis="y", labelsize=8.5, labelcolor=theme.INK)
@@ -216,7 +210,7 @@ def flight_panels(
         else:
             success = NONE if rate.value is None else f"{100 * rate.value:.{rate_digits(rate)}f} %"
             told = f"{path.value:.1f} m" if path.value is not None else NONE
-            detail = f"{success} of {rate.n:,} reached the goal, mean {DISTANCE.title} {told}"
+            detail = f"{success} of {rate.n:,} reached the goal, median {DISTANCE.title} {told}"
         arena = arena_of(run, tests[0])
         panels.append(RunFlights(figures.heading, detail, tests, run.trajectories, arena))
     return panels

@@ -61,7 +61,7 @@ def hardware_gap_sentence(comparison: comparison_model.Comparison, arena: str) -
         difference = trained.paired.flight_time_s.difference
         told = "with no common success"
         if difference.value is not None:
-            told = f"{difference.value:+.1f} %{_interval(difference)}"
+            told = f"a median {difference.value:+.1f} %{_interval(difference)}"
         sentence += f"; against the conditions of its own training that is {told} of flight time"
     return f"{sentence}."
 
@@ -79,7 +79,7 @@ def _longer(contrast: comparison_model.Contrast) -> str:
     if difference.value is None:
         return "(no goal that both reached) longer"
     comparative = "shorter" if difference.value < 0.0 else "longer"
-    return f"{abs(difference.value):.1f} % {comparative}{_interval(difference)}"
+    return f"a median {abs(difference.value):.1f} % {comparative}{_interval(difference)}"
 
 
 def _interval(difference: Estimate) -> str:
@@ -267,9 +267,9 @@ def runs_table(comparison: comparison_model.Comparison, arena: str) -> TableView
             told = (NONE if figure is None else f"{figure:.4g}" for figure in figures)
             rows.append(("  paper", f"{run.published.latency_ms:g}", NONE, *told))
     notes = (
-        "Each by itself; time, distance and energy: means over its own flights that reached the "
-        "goal, not the same ones in every row: compare by the gaps. t2: of every decision. In "
-        "brackets: 95 % intervals, Wilson for the success rate, bootstrap (BCa).",
+        "Each by itself; time, distance and energy: medians over its own flights that reached the "
+        "goal, not the same ones in every row: compare by the gaps. The paper prints means. t2: of "
+        "every decision. In brackets: 95 % intervals.",
     )
     return TableView(
         f"flown-{Path(arena).stem}",
@@ -374,12 +374,10 @@ def _arena_sections(
                 "Hardware gap",
                 3,
                 tables=(gaps_table(comparison, arena),),
-                draw=lambda: contrast_pictures(
-                    f"hardware-gap-{name}", comparison, contrasts, medians=True
-                ),
+                draw=lambda: contrast_pictures(f"hardware-gap-{name}", comparison, contrasts),
                 sheet=f"hardware-gap-{name}.png",
-                note="Dots: gaps of the means on the same seeds, bars: their 95 % intervals. "
-                f"Diamonds: medians of the pairs.{crosses} The line of zero: no gap.",
+                note="Dots: gaps on the same seeds, bars: their 95 % intervals."
+                f"{crosses} The line of zero: no gap.",
             )
         )
     sections.append(

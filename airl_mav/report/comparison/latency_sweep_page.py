@@ -171,7 +171,8 @@ def latency_quality_table(comparison: comparison_model.Comparison, policy: str) 
         for run in comparison.group(policy)
     )
     notes = (
-        "Means over the flights that reached the goal at that latency, 95 % intervals in brackets.",
+        "Medians over the flights that reached the goal at that latency, 95 % intervals in "
+        "brackets.",
     )
     return TableView(f"{policy}-by-latency", f"{policy} by latency", columns, rows, notes)
 

@@ -13,7 +13,6 @@ from airl_mav.report.measures import (
     COMPUTER_ENERGY,
     CONDUCT,
     CONDUCT_NOTE,
-    FEW_FLIGHTS,
     MEASURES,
     QualityMeasure,
     count_successes,
@@ -34,8 +33,6 @@ _PUBLISHED = {
     "energy_j": ("energy_kj", "energy_percent"),
 }
 """Fields of a published run (in the displayed unit) and a published gap, by measure key."""
-
-_NARROW = "Bootstrap intervals of fewer than {} {} are too narrow."
 
 
 def published_value(run: ComparedRun, measure: QualityMeasure) -> float | None:
@@ -98,11 +95,9 @@ def runs_table(
         for run in runs
     )
     notes = [
-        "Each run by itself, 95 % intervals in brackets (Wilson, bootstrap); time, distance and "
-        "energy: means over the flights that reached the goal."
+        "Each run by itself, 95 % intervals in brackets; time, distance and energy: medians over "
+        "the flights that reached the goal."
     ]
-    if min(run.quality.flight_time_s.n for run in runs) < FEW_FLIGHTS:
-        notes.append(_NARROW.format(FEW_FLIGHTS, "flights"))
     if len({run.quality.success_rate.n for run in runs}) > 1:
         notes.append("Not the same number of flights in all runs: compare on the same seeds.")
     return document.TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
@@ -174,6 +169,12 @@ def stages_table(runs: Sequence[ComparedRun]) -> document.TableView:
 # --- contrasts
 
 
+def _intervals(comparison: Comparison) -> str:
+    """Return the kinds of intervals of success and of the other measures."""
+    rates = "by betting, valid at any stop," if comparison.stopped else "Tango's"
+    return f"{rates} for the success, order statistics for the medians"
+
+
 def contrast_table(
     comparison: Comparison, contrast: Contrast, measures: Sequence[QualityMeasure] = MEASURES
 ) -> document.TableView:
@@ -185,7 +186,6 @@ def contrast_table(
         document.Column(target.mark),
         document.Column("difference"),
         document.Column("95 % interval"),
-        document.Column("median of pairs", page_only=True),
         document.Column("pairs"),
     ]
     if contrast.published is not None:
@@ -198,12 +198,9 @@ def contrast_table(
     notes = [
         f"Of {a.n:,} seeds both reached the goal in {a.both:,}, only {reference.mark} in "
         f"{a.only_reference:,}, only {target.mark} in {a.only_other:,}, neither in {a.neither:,}.",
-        f"Time, distance and energy: means over {count_successes(n)}; the median over the pairs "
-        "is of the difference of each seed. Intervals: Tango's score interval for the success "
-        "rate, bootstrap over pairs (BCa) for the means, binomial for the medians.",
+        f"Time, distance and energy: medians over {count_successes(n)}; the difference is the "
+        f"median of the seeds' differences. Intervals: {_intervals(comparison)}.",
     ]
-    if 1 < n < FEW_FLIGHTS:
-        notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
     title = versus(comparison, contrast)
     if contrast.entry.short:
         title += f": {contrast.entry.title}"
@@ -223,7 +220,6 @@ def _contrast_row(
         measure.plain(change.other, unit=True),
         document.NONE if d.value is None else f"{d.value:+.2f} {unit}",
         interval_of(d, 2, "+") or document.NONE,
-        document.NONE if change.median is None else with_interval(change.median, 1, "+"),
         f"{d.n:,}",
     )
     if contrast.published is None:
@@ -263,14 +259,12 @@ def contrasts_table(
             for c in contrasts
             if c.entry.title
         ),
-        "Difference: 100 (target - reference) / reference, in percent; success: percentage "
-        "points. The same seeds; time, distance and energy over the pairs of which both reached "
-        "the goal. In brackets: 95 % intervals, Tango's for the success, bootstrap over pairs "
-        "(BCa) for the means.",
+        "Difference: the median over the pairs of 100 (target - reference) / reference, in "
+        "percent; success: percentage points. The same seeds; time, distance and energy over the "
+        "pairs of which both reached the goal. In brackets: 95 % intervals, "
+        f"{_intervals(comparison)}.",
         *notes,
     ]
-    if min((c.successes for c in contrasts), default=FEW_FLIGHTS) < FEW_FLIGHTS:
-        notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
     return document.TableView(
         "contrasts", title, columns, tuple(rows), tuple(notes), in_terminal="stacked"
     )
@@ -285,7 +279,7 @@ def contrast_headlines(contrast: Contrast, digits: int = 2) -> tuple[Headline, .
         more = [] if told is None else [f"{THE_PAPER} {told:+.1f}"]
         headlines.append(
             estimate_headline(
-                measure.title, d, measure.difference_unit, digits=digits, sign="+", more=more
+                measure.headline, d, measure.difference_unit, digits=digits, sign="+", more=more
             )
         )
     return tuple(headlines)
