@@ -8,7 +8,6 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.options import scenario_of
 from airl_mav.cli.shared_options import OnboardOptions, episodes, fly_and_show
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.hardware_gap import (
@@ -22,11 +21,11 @@ from airl_mav.scenario.model import DEFAULT_ARENA
 class HardwareGapOptions(OnboardOptions):
     """Measure the hardware gap: a policy's loss on an onboard computer, also with mitigation.
 
-    The policy flies on a workstation and on the onboard computer. A policy trained with that
-    computer's latency flies there, in its training conditions, and on the workstation. All runs use
-    the same seeds. The tables show gaps of success, flight time, distance and energy with 95 %
-    intervals, against both references, and the paper's results. The same --out resumes an
-    interrupted run.
+    The policy flies on a workstation, with the onboard computer's latency alone, and on the whole
+    onboard computer. A policy trained with that latency flies there, in its training conditions,
+    and on the workstation. All runs use the same seeds. The tables show gaps of success, flight
+    time, distance and energy with 95 % intervals, against both references, and the paper's results.
+    The same --out resumes an interrupted run.
 
     Examples:
         airl hardware-gap
@@ -64,7 +63,7 @@ OPTIONS = HardwareGapOptions
 def run(options: HardwareGapOptions, console: Console | None = None) -> int:
     """Measure the gap; exit status and errors as in `fly_and_show`."""
     experiment = declare_hardware_gap(
-        scenario_of(options),
+        options.scenario,
         mitigated=options.mitigated,
         reference=options.reference,
         reference_workload=options.reference_workload,

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from airl_mav import __version__
 from airl_mav.black_box.messages import SUFFIX
-from airl_mav.cli.options import REPEATED, check_installed
+from airl_mav.cli.options import REPEATED, check_installed, scenario_of
 from airl_mav.core import addons, clock, errors, fields, progress
 from airl_mav.rehearsal.live_view import ViewRequest
 from airl_mav.scenario import aircraft, model
@@ -303,8 +303,9 @@ class OnboardOptions(Gate, ExperimentOptions):
 
     GROUP: ClassVar[str] = "latency"
     computer: str = Field(
-        default=model.ONBOARD_COMPUTER,
-        description="onboard computer: a shipped profile, or a path to a .toml",
+        default="",
+        description="onboard computer: a shipped profile, or a path to a .toml; by default"
+        f" {model.ONBOARD_COMPUTER}, or none with --latency: without mass and power",
     )
     reference: Annotated[str, fields.COMMON] = Field(
         default=model.REFERENCE_COMPUTER,
@@ -317,6 +318,12 @@ class OnboardOptions(Gate, ExperimentOptions):
         " the one measured there with this policy, else 1 ms (gym, lockstep) or the time on this"
         " machine (sitl)",
     )
+
+    @property
+    def scenario(self) -> model.Scenario:
+        """Scenario of the options; a latency without a named computer has no mass and power."""
+        default = model.ONBOARD_COMPUTER if self.latency is None else self.reference
+        return scenario_of(self, computer=self.computer or default)
 
 
 def fly_and_show(

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
+from airl_mav.cli.options import POSITIONAL, REPEATED
 from airl_mav.cli.shared_options import (
     Gate,
     OnboardOptions,
@@ -74,7 +74,7 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
     requirements = requirements_of(asked)
     with voice:
         sought = hardware_gap.seek_verdict(
-            scenario_of(options),
+            options.scenario,
             requirements,
             reference=options.reference,
             reference_workload=options.reference_workload,

@@ -51,6 +51,9 @@ TRAINING_LATENCY_SEED = 1
 latencies the mitigated policy would be compared with itself."""
 
 
+LATENCY_ALONE = "latency-alone"
+"""Role of the policy with the target's latency, but on the reference computer."""
+
 COMPENSATED, PIPELINED, BOTH = "compensated", "compensated-pipelined", "mitigated-compensated"
 
 COMPENSATION: dict[str, dict[str, Any]] = {
@@ -100,8 +103,9 @@ def hardware_gap(
 ) -> experiment.ExperimentResult:
     """Measure a policy's loss on an onboard computer, with and without mitigation.
 
-    All runs use the same seeds. The policy flies on the reference and on the onboard computer,
-    there also with latency compensation and with pipelined decisions. A policy trained with that
+    All runs use the same seeds. The policy flies on the reference, with the onboard computer's
+    latency alone, and on the whole onboard computer: with its mass and power. There it flies also
+    with latency compensation and with pipelined decisions. A policy trained with that
     latency flies there, compensated, under its training conditions, and on the reference. Raises as
     `evaluate`.
 
@@ -152,9 +156,12 @@ def declare_hardware_gap(
     training, remarks = _training(other, target)
     ways, more = _ways_of_compensation(scenario, policy)
     remarks += more
+    alone, more = _latency_alone(target, undelayed)
+    remarks += more
     planned = [
         ("reference", "reference", policy, undelayed),
         ("target", "target", policy, target),
+        *((LATENCY_ALONE, LATENCY_ALONE, policy, place) for place in alone),
         *((role, role, policy, target) for role in ways),
     ]
     if other is not None:
@@ -250,6 +257,22 @@ def _target(scenario: Scenario) -> ComputerConditions:
     if scenario.workload is not None:
         raise FieldError("latency", scenario.latency, "without a workload")
     return ComputerConditions(scenario.latency, scenario.computer, None, scenario.latency)
+
+
+def _latency_alone(
+    target: ComputerConditions, reference: ComputerConditions
+) -> tuple[tuple[ComputerConditions, ...], tuple[str, ...]]:
+    """Return the target's latency on the reference computer, and remarks."""
+    board = load_computer(target.computer)
+    if not board.onboard_mass_kg and not board.onboard_watts:
+        if target.latency is None:
+            return (), ()
+        return (), ("The latency is flown alone. To add mass and power, name a computer.",)
+    source = target.latency or f"{target.computer}/{target.workload}"
+    if target.latency is None and target.workload not in board.workloads:
+        return (), (f"The latency of {source} is an estimate: not flown alone.",)
+    name = f"{Path(source).name} alone"
+    return (ComputerConditions(name, reference.computer, None, source),), ()
 
 
 def _reference(

@@ -48,7 +48,8 @@ from tests.support.command_line import airl, option_words
 HARDWARE_GAP_FILE = "hardware-gap.json"
 EPISODES = 24
 RETRAINED = ("mitigated", "mitigated-compensated", "training", "mitigated-reference")
-NOT_RETRAINED = ("reference", "target", "compensated", "compensated-pipelined")
+ALONE = "latency-alone"
+NOT_RETRAINED = ("reference", "target", ALONE, "compensated", "compensated-pipelined")
 ROLES = NOT_RETRAINED + RETRAINED
 
 
@@ -153,9 +154,10 @@ def test_the_columns_and_what_they_are_flown_on(whole: tuple[Path, str]) -> None
     assert means == dict.fromkeys(ROLES, 396.0) | {"reference": 11.0, "mitigated-reference": 11.0}
     watts = {role: info["setup"]["computer_watts"] for role, info in runs.items()}
     # The computer's power is the target's in the training conditions, too.
-    assert watts == dict.fromkeys(ROLES, 1.7) | {"reference": 0.0, "mitigated-reference": 0.0}
+    undelayed = ("reference", "mitigated-reference")
+    assert watts == dict.fromkeys(ROLES, 1.7) | dict.fromkeys((*undelayed, ALONE), 0.0)
     on_ground = [role for role, info in runs.items() if info["setup"]["computer_on_ground"]]
-    assert on_ground == ["reference", "mitigated-reference"]
+    assert on_ground == ["reference", ALONE, "mitigated-reference"]
     assert {tuple(info["seeds"]) for info in runs.values()} == {tuple(range(1, EPISODES + 1))}
     assert runs["training"]["config"]["latency_seed"] == TRAINING_LATENCY_SEED != 0
 
@@ -184,6 +186,27 @@ def test_the_training_conditions_are_other_draws_of_the_same_latency(
         assert values.std() == pytest.approx(19.8e3, rel=0.25)
 
 
+def test_the_latency_alone_is_that_of_airl_evaluate(
+    whole: tuple[Path, str], tmp_path: Path
+) -> None:
+    """Same seeds, same latencies, no mass and power: equal flights, not those of the target."""
+    out, text = whole
+    options = {"level": "gym", "episodes": EPISODES, "latency": "ras-pi-4/template-5x32"}
+    words = option_words(**options | {"out": tmp_path / "evaluated"})
+    assert airl("evaluate", DEFAULT_UNMITIGATED, *words)[0] == 0
+    alone, target = (out / f"static-obstacles-{role}" for role in (ALONE, "target"))
+
+    def flown(run: Path) -> list[tuple[Any, ...]]:
+        return [(s, e["outcome"], e["quality"]) for s, e in lines(run).items()]
+
+    assert flown(alone) == flown(tmp_path / "evaluated") != flown(target)
+    there, here = drawn(target), drawn(alone)
+    assert all(there[index][0] == here[index][0] for index in there)
+    assert "With that latency alone, without mass and power, it flies a median" in " ".join(
+        text.split()
+    )
+
+
 def test_t2_is_that_of_the_flights(whole: tuple[Path, str]) -> None:
     out, _ = whole
     for column in columns_of(data_of(out)):
@@ -200,6 +223,7 @@ def test_t2_is_that_of_the_flights(whole: tuple[Path, str]) -> None:
     ("key", "target", "reference"),
     [
         ("without-mitigation", "target", "reference"),
+        ("latency-alone", "latency-alone", "reference"),
         ("compensated", "compensated", "reference"),
         ("compensated-pipelined", "compensated-pipelined", "reference"),
         ("with-mitigation", "mitigated", "reference"),
@@ -230,18 +254,15 @@ def test_gaps_are_those_of_the_files(
         values = np.array(
             [(first[s]["quality"][metric], second[s]["quality"][metric]) for s in common]
         )
-        means = values.mean(axis=0)
+        medians = np.median(values, axis=0)
         change = found[metric]
-        assert [change["reference"], change["other"]] == pytest.approx(list(means))
-        if not means[0]:  # of a computer on the ground
-            assert change["difference"]["value"] is change["median"]["value"] is None
+        assert [change["reference"], change["other"]] == pytest.approx(list(medians))
+        if not medians[0]:  # of a computer on the ground
+            assert change["difference"]["value"] is None
             continue
         assert change["difference"]["n"] == len(common)
-        assert change["difference"]["value"] == pytest.approx(100.0 * (means[1] / means[0] - 1.0))
         median = 100.0 * np.median(values[:, 1] / values[:, 0] - 1.0)
-        assert found[metric]["median"]["value"] == pytest.approx(median, abs=1e-9)
-    both = found["energy_j"]["other"] + found["computer_energy_j"]["other"]
-    assert found["total_energy_j"]["other"] == pytest.approx(both)
+        assert change["difference"]["value"] == pytest.approx(median, abs=1e-9)
 
 
 def test_the_gap_appears(whole: tuple[Path, str]) -> None:
@@ -270,7 +291,7 @@ def test_the_same_policy_has_the_same_gap_and_none_where_it_was_trained(
         assert with_[metric] == without[metric]
     nothing = gap_of(data, "mitigation-on-target")
     assert nothing["flight_time_s"]["difference"]["value"] == 0.0
-    assert gap_of(data, "cost-on-reference")["distance_m"]["median"]["value"] == 0.0
+    assert gap_of(data, "cost-on-reference")["distance_m"]["difference"]["value"] == 0.0
     trained = gap_of(data, "with-mitigation-trained")["flight_time_s"]["difference"]
     assert trained["value"] != 0.0
     assert trained["low"] < 0.0 < trained["high"]
@@ -342,8 +363,8 @@ def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
     assert first[2].startswith(f"{difference.value:+.1f} [")
     assert "+86.6" in gaps_table(gap, arena).rows[1]
     detail = contrast_table(gap, gap.contrasts[0], ALL_MEASURES)
-    assert len(detail.columns) == 10
-    assert {len(row) for row in detail.rows} == {10}
+    assert len(detail.columns) == 9
+    assert {len(row) for row in detail.rows} == {9}
 
 
 def test_the_file_is_the_whole_comparison(whole: tuple[Path, str], tmp_path: Path) -> None:
@@ -397,7 +418,7 @@ def test_the_page_opens_offline_and_its_pictures_lie_beside_it(whole: tuple[Path
 
 def test_the_markdown_has_every_table(whole: tuple[Path, str]) -> None:
     text = (whole[0] / "hardware-gap.md").read_text()
-    assert text.count("\n| --- |") == 11  # The runs, the gaps, nine in detail.
+    assert text.count("\n| --- |") == 12  # The runs, the gaps, nine in detail.
     for block in re.findall(r"(?:^\|.*\|\n)+", text, re.M):
         rows = [re.findall(r"(?<!\\)\|", line) for line in block.splitlines()]
         assert len({len(row) for row in rows}) == 1
@@ -434,7 +455,7 @@ def test_the_same_out_shows_it_again(whole: tuple[Path, str], mitigated: str) ->
     before = data_of(out)
     code, again = measure(mitigated, out=out)
     assert code == 0
-    assert again.count("(flown before)") == 8
+    assert again.count("(flown before)") == 9
     assert data_of(out) == before
     assert (
         again.partition("Each run by itself")[2].partition("gap  ")[0]
@@ -480,8 +501,8 @@ def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigate
     [
         ("[", "JSON"),
         ('{"schema": 9}', "schema = 9"),
-        ('{"schema": 2, "facts": {}}', "runs: missing"),
-        ('{"schema": 2, "facts": {}, "runs": []}', "no run here"),
+        ('{"schema": 3, "facts": {}}', "runs: missing"),
+        ('{"schema": 3, "facts": {}, "runs": []}', "no run here"),
         pytest.param("[" * 100_000, "nested", id="nested"),
     ],
 )
@@ -538,6 +559,26 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
     assert data["extra"]["published_tables"] == {}
     assert a["published"] is b["published"] is None
     assert data["facts"]["latency"] == latency
+    # A latency without a computer is flown without mass and power.
+    assert [c["role"] for c in columns_of(data)] == [r for r in NOT_RETRAINED if r != ALONE]
+    assert {run["setup"]["computer_watts"] for run in data["runs"]} == {0.0}
+    assert "The latency is flown alone" in data["facts"]["remarks"][0]
+
+
+def test_a_named_computer_is_flown_whole_and_its_latency_alone(tmp_path: Path) -> None:
+    options = {"latency": "150ms", "computer": "ras-pi-4", "episodes": 2}
+    assert measure("none", out=tmp_path / "out", **options)[0] == 0
+    columns = {c["role"]: c["setup"] for c in columns_of(data_of(tmp_path / "out"))}
+    assert list(columns) == list(NOT_RETRAINED)
+    assert columns["target"]["computer_watts"] == 1.7
+    assert columns[ALONE]["computer_watts"] == 0.0
+    assert columns[ALONE]["injection"] == columns["target"]["injection"]
+
+
+def test_the_latency_of_an_estimate_is_not_flown_alone() -> None:
+    roles, (remark,) = roles_of(workload="estimate")
+    assert ALONE not in roles
+    assert "is an estimate: not flown alone" in remark
 
 
 def test_defaults_are_those_of_the_package() -> None:
@@ -602,14 +643,14 @@ def roles_of(**asked: Any) -> tuple[list[str], tuple[str, ...]]:
 
 def test_it_compensates_where_that_can_be(tmp_path: Path) -> None:
     assert roles_of()[0] == list(NOT_RETRAINED)
-    assert roles_of(compensate=False) == (["reference", "target"], ())
+    assert roles_of(compensate=False) == (["reference", "target", ALONE], ())
     profile = (profiles_dir() / "vehicles" / "quad.toml").read_text()
     (tmp_path / "unknown.toml").write_text(profile.partition("[response]")[0])
     roles, (remark,) = roles_of(vehicle=str(tmp_path / "unknown.toml"))
-    assert roles == ["reference", "target"]
+    assert roles == ["reference", "target", ALONE]
     assert "response of vehicle" in remark
     roles, (remark,) = roles_of(watchdog={"hover_after_s": 0.06})
-    assert roles == ["reference", "target", "compensated"]
+    assert roles == ["reference", "target", ALONE, "compensated"]
     assert "not pipelined" in remark
 
 

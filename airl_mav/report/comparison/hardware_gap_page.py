@@ -30,7 +30,7 @@ from airl_mav.report.run_tables import computer_power
 
 WITHOUT, WITH = "without-mitigation", "with-mitigation"
 WITH_TRAINED, WITHOUT_TRAINED = "with-mitigation-trained", "without-mitigation-trained"
-COMPENSATED = "compensated"
+COMPENSATED, LATENCY_ALONE = "compensated", "latency-alone"
 
 
 def hardware_gap_sentence(comparison: comparison_model.Comparison, arena: str) -> str:
@@ -44,6 +44,12 @@ def hardware_gap_sentence(comparison: comparison_model.Comparison, arena: str) -
         f"On {_computer(target)}{place} {target.setup.policy.name} flies {_longer(gap)} than on "
         f"{_computer(reference)} and reaches {_rate(target)} of its goals, not {_rate(reference)}."
     )
+    if (alone := gaps.get(LATENCY_ALONE)) is not None:
+        rate = _rate(comparison.run(alone.entry.target))
+        sentence += (
+            " With that latency alone, without mass and power, it flies"
+            f" {_longer(alone)} and reaches {rate}."
+        )
     if (compensated := gaps.get(COMPENSATED)) is not None:
         rate = _rate(comparison.run(compensated.entry.target))
         sentence += (
@@ -102,7 +108,7 @@ COST, HELP = "cost-on-reference", "mitigation-on-target"
 PARTS_OF_ENERGY = (measures.ENERGY, measures.COMPUTER_ENERGY)
 """Parts of the energy for the page; the terminal has room only for their sum."""
 
-HEADLINED = (WITHOUT, COMPENSATED, WITH, WITH_TRAINED)
+HEADLINED = (WITHOUT, LATENCY_ALONE, COMPENSATED, WITH, WITH_TRAINED)
 """Gaps shown as headlines of an arena."""
 
 
@@ -113,6 +119,13 @@ _NO_MITIGATION, _MITIGATED = "no mitigation", "mitigated"
 GAP_KINDS = (
     comparison_model.ContrastEntry(
         "target", "reference", WITHOUT, f"without {_UNDELAYED}", _NO_MITIGATION
+    ),
+    comparison_model.ContrastEntry(
+        LATENCY_ALONE,
+        "reference",
+        LATENCY_ALONE,
+        "latency of the target without its mass and power, reference undelayed",
+        "latency alone",
     ),
     comparison_model.ContrastEntry(
         "compensated",
