@@ -17,12 +17,15 @@ from airl_mav.cli.shared_options import (
     leave,
     requirements_of,
 )
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments import hardware_gap, live
 from airl_mav.flight.requirements import LOOKS
 from airl_mav.scenario import model
 
 DEFAULT_REQUIREMENT = "success >= 95 %"
+DEFAULT_GAP = "success gap >= 0 points"
+"""Default requirement for a comparison of two policies."""
 
 
 class VerdictOptions(OnboardOptions):
@@ -30,16 +33,23 @@ class VerdictOptions(OnboardOptions):
 
     Flights are added until the rate is shown to be met or not met. The probability of a wrong
     verdict is at most 5 %, regardless of the number of interim analyses. The same seeds are then
-    flown on the reference, for a comparison page. The same --out resumes an interrupted run.
+    flown on the reference, for a comparison page. With --against, two policies fly the same seeds
+    until their gap of success is decided. The same --out resumes an interrupted run.
 
     Examples:
         airl verdict static-obstacles --computer ras-pi-4 --workload template-5x32
         airl verdict MINE --latency pi.txt --require "success >= 98 %"
+        airl verdict MINE --against static-obstacles --require "success gap >= -2 points"
     """
 
     policy: Annotated[str, POSITIONAL] = Field(
         default=model.DEFAULT_POLICY,
         description="a name, or a path to a folder with policy.onnx and card.json",
+    )
+    against: Annotated[str | None, COMMON] = Field(
+        default=None,
+        description="another policy, a name or path: flies on the same computer and seeds until the"
+        f" gap of success is decided; by default '{DEFAULT_GAP}'",
     )
     arena: model.ArenaName = model.DEFAULT_ARENA
     require: Annotated[tuple[str, ...], REPEATED] = Field(
@@ -70,14 +80,19 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
     """Seek the verdict; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     voice = Voice(options, "airl verdict", console)
     # Not the field's default: given requirements would be appended to the default.
-    asked = options.model_copy(update={"require": options.require or (DEFAULT_REQUIREMENT,)})
+    default = DEFAULT_REQUIREMENT if options.against is None else DEFAULT_GAP
+    asked = options.model_copy(update={"require": options.require or (default,)})
     requirements = requirements_of(asked)
+    undelayed = options.reference, options.reference_workload
+    if options.against and undelayed != (model.REFERENCE_COMPUTER, None):
+        raise FieldError("against", options.against, "left out with --reference")
     with voice:
         sought = hardware_gap.seek_verdict(
             options.scenario,
             requirements,
             reference=options.reference,
             reference_workload=options.reference_workload,
+            against=options.against,
             out=options.out,
             progress=voice.progress,
         )

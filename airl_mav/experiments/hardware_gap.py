@@ -1,6 +1,6 @@
 """Hardware gap: a policy on a workstation and on an onboard computer, also with mitigation.
 
-The verdict is a group-sequential test of its success rate there (`flight.sequential`).
+The verdict is a sequential test of its success rate there, or of its gap (`flight.requirements`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from airl_mav.experiments import experiment
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.live import Ended, FlownRun
-from airl_mav.flight.requirements import LOOKS, Requirement, RequirementDecision
-from airl_mav.flight.statistics import reached_goals
+from airl_mav.flight.requirements import LOOKS, Requirement, all_decided
+from airl_mav.flight.statistics import pair_by_seed, reached_goals
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
-from airl_mav.report.comparison.comparison_model import Comparison, comparison_file
+from airl_mav.report.comparison.comparison_model import FLOWN_UNTIL, Comparison, comparison_file
 from airl_mav.report.run_verdict import OverallVerdict
 from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 from airl_mav.scenario.resolve import resolve
@@ -340,19 +340,34 @@ def seek_verdict(
     *,
     reference: str,
     reference_workload: str | None = None,
+    against: str | None = None,
     out: Path | None = None,
     progress: Progress,
 ) -> SoughtVerdict:
-    """Fly a policy on its onboard computer until the test is decided, then on the reference."""
-    tests = [each.test() for each in requirements if each.least_rate]
-    if not tests:
-        raise FieldError("require", accepted="at least one least success rate: 'success >= 95 %'")
-    declared = declare_hardware_gap(
-        scenario,
-        mitigated=NOT_MITIGATED,
-        reference=reference,
-        reference_workload=reference_workload,
-    )
+    """Fly a policy on its onboard computer until the tests are decided, then the reference.
+
+    The reference is the same policy on the reference computer, or another policy `against` which it
+    is compared on the same computer. A required gap of the success rate is tested while both fly.
+    """
+    sequential = [each for each in requirements if each.least_rate or each.rate_gap]
+    if not sequential:
+        raise FieldError(
+            "require",
+            accepted="at least one least success rate, or gap of it: 'success >= 95 %'"
+            " or 'success gap >= -2 points'",
+        )
+    # Rejects a success rate that no number of flights shows.
+    all_decided(requirements, ())
+    if against is None:
+        declared = declare_hardware_gap(
+            scenario,
+            mitigated=NOT_MITIGATED,
+            reference=reference,
+            reference_workload=reference_workload,
+        )
+    else:
+        declared = _declare_rivals(scenario, against)
+    both_fly = any(each.rate_gap for each in sequential)
     cells = {cell.role: cell for cell in declared.cells}
     target, undelayed = cells["target"], cells["reference"]
     out = (
@@ -366,15 +381,16 @@ def seek_verdict(
     with experiment.workers_of(scenario) as executor:
         fly = partial(_fly, out=out, progress=progress, executor=executor)
         for n in _looks(scenario.episodes, _planned(out / target.name)):
-            flown = fly(target, n)
-            if flown.ended != "complete":
-                return SoughtVerdict(out, flown.ended)
+            flown, rival = fly(target, n), None
+            if both_fly and flown.ended == "complete":
+                rival = fly(undelayed, n)
+            if (last := rival or flown).ended != "complete":
+                return SoughtVerdict(out, last.ended)
             reached = reached_goals(flown.episodes)
-            decided = all(
-                test.decide(reached) is not RequirementDecision.UNDECIDED for test in tests
-            )
+            pairs = () if rival is None else pair_by_seed(rival.episodes, flown.episodes)
             # Flights that remain invalid prevent a verdict; further flights do not help.
-            if decided or len(reached) < n:
+            missing = len(reached) < n or (both_fly and len(pairs) < n)
+            if missing or all_decided(requirements, reached, pairs):
                 break
         flown = fly(undelayed, max(n, _planned(out / undelayed.name)))
     if flown.ended != "complete":
@@ -382,7 +398,11 @@ def seek_verdict(
     # Imported here: flights do not need the figures.
     from airl_mav.report.comparison import show
 
-    facts = {**declared.facts, "episodes": n, show.FLOWN_UNTIL: "the success rate was decided"}
+    facts = {
+        **declared.facts,
+        "episodes": n,
+        FLOWN_UNTIL: f"decided: {', '.join(map(str, sequential))}",
+    }
     # The last interim analysis sets the planned number, which the run folder contains.
     entries = [
         replace(experiment.entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)
@@ -390,6 +410,25 @@ def seek_verdict(
     comparison, runs = show.build_comparison(out, declared.kind, facts, entries)
     verdict = show.judge_comparison(comparison, runs, requirements)
     return SoughtVerdict(out, "complete", verdict, comparison, runs)
+
+
+def _declare_rivals(scenario: Scenario, against: str) -> experiment.Experiment:
+    """Declare a comparison of two policies on the same computer and seeds."""
+    target = _target(scenario)
+    policies = {
+        "reference": (against, find_policy(against, trust=scenario.trust)),
+        "target": (scenario.policy, find_policy(scenario.policy, trust=scenario.trust)),
+    }
+    names = {role: found.name for role, (_, found) in policies.items()}
+    if names["reference"] == names["target"]:
+        raise FieldError("against", against, "another policy")
+    cells = []
+    for role, (policy, _) in policies.items():
+        label = f"{names[role]} {target.label}"
+        asked = scenario.model_copy(update={"policy": policy, **target.fields})
+        cells.append(experiment.make_cell(role, label, asked, label=label, role=role))
+    facts = {"policy": names["target"], "against": names["reference"]}
+    return experiment.Experiment("compare", " against ".join(facts.values()), facts, tuple(cells))
 
 
 def _fly(

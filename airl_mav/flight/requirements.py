@@ -6,9 +6,9 @@ the whole interval fulfils it, not met if no part does, and undecided between.
 A minimum success rate is tested sequentially, while flights come in. Repeated evaluation of an
 ordinary interval, with a stop at its decision, increases the error. A group-sequential test
 distributes the error over planned interim analyses, the looks (Lan & DeMets, Biometrika 70, 1983;
-Jennison & Turnbull, Group Sequential Methods with Applications to Clinical Trials, 2000, chapters 7
-and 12). Flights are counted, so the error is exact, from binomial sums instead of a normal
-approximation.
+Jennison & Turnbull, Group Sequential Methods with Applications to Clinical Trials, 2000, chapters
+7, 8 and 12). Flights are counted, so the error is exact, from binomial sums instead of a normal
+approximation. A gap of success rates is tested on an interval that holds at any stop.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 from typing import Literal, NamedTuple
@@ -25,6 +25,7 @@ import numpy as np
 import scipy
 
 from airl_mav.core.errors import FieldError
+from airl_mav.flight import statistics
 from airl_mav.flight.statistics import Aggregate, Estimate, PairedComparison, wilson
 
 MOST_FLIGHTS = 1_000_000
@@ -92,8 +93,13 @@ class Requirement:
 
     @property
     def least_rate(self) -> bool:
-        """True for a minimum success rate, which allows a sequential test."""
+        """True for a minimum success rate, which allows a group-sequential test."""
         return (self.measure, self.gap, self.sense) == ("success", False, ">=")
+
+    @property
+    def rate_gap(self) -> bool:
+        """True for a gap of the success rate, which allows a sequential test over pairs."""
+        return self.measure == "success" and self.gap
 
     def test(self) -> RateTest:
         """Return the test of a minimum success rate. Raises FieldError for 100 %."""
@@ -182,8 +188,9 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
 def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
     """Return a finding for flights added until a minimum success rate was decided.
 
-    Repeated looks make the interval's error exceed its nominal 5 %. `reached` are the flights in
-    the order of their seeds. Findings of other requirements stay.
+    Repeated looks make the interval's error exceed its nominal 5 %. The estimate is that of the
+    deciding look, with an interval that holds at its stop. `reached` are the flights in the order
+    of their seeds. Findings of other requirements stay.
     """
     if not finding.requirement.least_rate:
         return finding
@@ -192,7 +199,25 @@ def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
     if decision is RequirementDecision.UNDECIDED and n:
         needed = test.flights_needed(sum(reached) / n, n)
         more = None if needed is None else needed - n
-    return replace(finding, decision=decision, more_flights=more)
+    return Finding(finding.requirement, decision, test.estimate(reached).scaled(100.0), more)
+
+
+def all_decided(
+    requirements: Sequence[Requirement],
+    reached: Sequence[bool],
+    pairs: Sequence[statistics.Pair] = (),
+) -> bool:
+    """Return True if every minimum success rate and every gap of it is decided.
+
+    Args:
+        requirements: Requirements; the others do not count.
+        reached: Goals reached (n,), in the order of the seeds.
+        pairs: Flights of the reference and of the run, for a gap.
+    """
+    gap = statistics.anytime_gap(statistics.count_agreement(pairs))
+    decisions = [each.test().decide(reached) for each in requirements if each.least_rate]
+    decisions += [decide(each, gap) for each in requirements if each.rate_gap]
+    return RequirementDecision.UNDECIDED not in decisions
 
 
 def decide(requirement: Requirement, estimate: Estimate) -> RequirementDecision:
@@ -333,12 +358,50 @@ class RateTest:
 
     def decide(self, reached: Sequence[bool]) -> RequirementDecision:
         """Return the decision of the first deciding look; later flights do not change it."""
-        done = sum(look <= len(reached) for look in LOOKS)
-        for look in _planned(self.threshold, done):
-            decision = look.decide(look.flights - sum(reached[: look.flights]))
-            if decision is not RequirementDecision.UNDECIDED:
-                return decision
-        return RequirementDecision.UNDECIDED
+        look, failures = self._analyses(reached)[-1]
+        return look.decide(failures)
+
+    def estimate(self, reached: Sequence[bool]) -> Estimate:
+        """Return the success rate at the last look, with an interval valid at that stop.
+
+        Results are ordered by stage: the earlier "meets", the better. The interval contains the
+        rates at which results as good as this one, and as bad, have over 2.5 % probability each
+        (Jennison & Turnbull, section 8.4). The threshold is outside exactly if the test decides.
+        The flights after the deciding look do not count. Before the first look, there is none.
+        """
+        looks, failed = zip(*self._analyses(reached), strict=True)
+        n, failures = looks[-1].flights, failed[-1]
+        if n == 0:
+            return statistics.NO_ESTIMATE
+        if n < LOOKS[0]:
+            return Estimate(1.0 - failures / n, None, None, n)
+        decided = looks[-1].decide(failures) is not RequirementDecision.UNDECIDED
+        # An undecided test may resume: the error of later looks is not spent yet.
+        allowed = 0.5 * ALPHA if decided else error_spent(n)
+
+        def end(side: int) -> float:
+            if failures == (n, 0)[side]:
+                return float(side)
+            inside, outside = 1.0 - failures / n, float(side)
+            while abs(outside - inside) > RATE_PRECISION:
+                rate = 0.5 * (inside + outside)
+                if _stagewise(looks, failures, rate)[side] > allowed:
+                    inside = rate
+                else:
+                    outside = rate
+            return outside
+
+        return Estimate(1.0 - failures / n, end(0), end(1), n)
+
+    def _analyses(self, reached: Sequence[bool]) -> list[tuple[InterimAnalysis, int]]:
+        """Return the looks up to the deciding one, with failures; before the first, all flights."""
+        analyses = []
+        for look in _planned(self.threshold, sum(look <= len(reached) for look in LOOKS)):
+            analyses.append((look, look.flights - sum(reached[: look.flights])))
+            if look.decide(analyses[-1][1]) is not RequirementDecision.UNDECIDED:
+                break
+        n = len(reached)
+        return analyses or [(InterimAnalysis(n, -1, n + 1), n - sum(reached))]
 
     def flights_needed(self, rate: float, flown: int = 0) -> int | None:
         """Return the number of flights at which a rate would decide; None: not within `LOOKS`."""
@@ -347,3 +410,31 @@ class RateTest:
             if look.flights > flown and look.decide(failures) is not RequirementDecision.UNDECIDED:
                 return look.flights
         return None
+
+
+RATE_PRECISION = 1e-7
+"""Precision of the ends of a sequential test's interval, found by bisection."""
+
+
+def _stagewise(looks: Sequence[InterimAnalysis], failures: int, rate: float) -> tuple[float, float]:
+    """Return the probabilities, at a success rate, of ending as good as at a look, and as bad.
+
+    Args:
+        looks: Analyses up to the last one, which ended the test.
+        failures: Number of failures at the last look.
+        rate: Success rate, 0 to 1.
+    """
+    undecided, fewest, before = np.ones(1), 0, 0
+    good = bad = 0.0
+    for look in looks:
+        step = look.flights - before
+        new = scipy.stats.binom.pmf(np.arange(step + 1), step, 1.0 - rate)
+        undecided, before = np.convolve(undecided, new), look.flights
+        if look is looks[-1]:
+            break
+        few, many = look.few + 1 - fewest, look.many - fewest
+        good += float(undecided[:few].sum())
+        bad += float(undecided[many:].sum())
+        undecided, fewest = undecided[few:many], fewest + few
+    at = failures - fewest
+    return good + float(undecided[: at + 1].sum()), bad + float(undecided[at:].sum())

@@ -7,6 +7,7 @@ import re
 import signal
 import xml.etree.ElementTree as ET
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -16,9 +17,17 @@ from scipy import stats
 
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.campaign import EpisodeSaver
-from airl_mav.flight.requirements import LOOKS
+from airl_mav.flight.requirements import LOOKS, RateTest
+from airl_mav.flight.statistics import (
+    Agreement,
+    Estimate,
+    anytime_gap,
+    anytime_mean,
+    wilson,
+)
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from airl_mav.report.comparison import show
+from airl_mav.scenario.model import DEFAULT_POLICY
 from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
 from tests.support.page_alone import page_alone
@@ -29,12 +38,13 @@ TARGET, REFERENCE = "static-obstacles-target", "static-obstacles-reference"
 
 def verdict(out: Path, *, page: bool = False, **options: Any) -> tuple[int, str]:
     """Run the command in this process; without `page`, which takes longer than flights, none."""
+    policy = [policy] if (policy := options.pop("policy", None)) else []
     with (
         nullcontext()
         if page
         else patch.object(show, "write_document", lambda _, folder: folder / "hardware-gap.html")
     ):
-        return airl("verdict", *option_words(**(LATE | {"out": out} | options)))
+        return airl("verdict", *policy, *option_words(**(LATE | {"out": out} | options)))
 
 
 def interrupted_after(flights: int, out: Path) -> tuple[int, str]:
@@ -124,11 +134,12 @@ def test_the_same_folder_answers_other_questions(whole: tuple[Path, str]) -> Non
     code, text = verdict(out, require="success >= 50 %")
     assert (code, said(out)["status"]) == (0, "met")
     assert "\nmeets: success >= 50 %" in text
-    # The interval alone would decide this: it was not made to be looked at again and again.
+    # Wilson's interval alone would decide this: it does not allow repeated looks.
     with patch("airl_mav.cli.verdict_command.leave"):
         code, text = verdict(out, require="success >= 92 %", episodes=n)
     (finding,) = said(out)["findings"]
-    assert finding["estimate"]["high"] < 92.0
+    reached = outcomes(out / TARGET).count("success")
+    assert 100.0 * (wilson(reached, n).high or 0.0) < 92.0 < finding["estimate"]["high"]
     assert (code, said(out)["status"]) == (5, "undecided")
     assert re.search(r"about [\d,]+ more flights would tell", text)
     with patch.object(show, "write_document", lambda _, folder: folder / "hardware-gap.html"):
@@ -140,9 +151,63 @@ def test_the_same_folder_answers_other_questions(whole: tuple[Path, str]) -> Non
     assert code == 3
 
 
+def test_the_interval_beside_the_verdict_holds_after_the_stop(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    (finding,) = said(out)["findings"]
+    reached = [outcome == "success" for outcome in outcomes(out / TARGET)]
+    expected = RateTest(0.95).estimate(reached).scaled(100.0)
+    assert finding["estimate"] == pytest.approx(asdict(expected))
+    assert f"% [{expected.low:.1f}, {expected.high:.1f}], n = {len(reached)})" in text
+    # Tables of a stopped test do without Wilson's and Tango's intervals, too.
+    comparison, _ = show.rebuild_comparison(out)
+    n, goals = len(reached), sum(reached)
+    target = comparison.run(TARGET).quality.success_rate
+    assert target == anytime_mean([0.0, 1.0], [n - goals, goals])
+    (gap,) = comparison.contrasts
+    assert gap.paired.success_rate.difference == anytime_gap(gap.paired.agreement)
+    page = (out / "hardware-gap.html").read_text()
+    assert "by betting, valid at any stop, for the success" in page
+    assert "Tango" not in page
+
+
+def test_two_policies_fly_until_their_gap_is_decided(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = {"policy": "static-obstacles-ras-pi-4", "against": "static-obstacles"}
+    code, text = verdict(out, **options)
+    assert (code, said(out)["status"]) == (0, "met")
+    (finding,) = said(out)["findings"]
+    assert finding["requirement"]["gap"] is True
+    assert text.count("meets: success gap >= 0 points") == 1
+    ends = [outcomes(out / role) for role in ("reference", "target")]
+    assert len(ends[0]) == len(ends[1]) == finding["estimate"]["n"]
+    assert len(ends[0]) in LOOKS
+    pairs = [(a == "success", b == "success") for a, b in zip(*ends, strict=True)]
+
+    def gap(n: int) -> Estimate:
+        both, lost, gained, neither = (
+            pairs[:n].count(kind)
+            for kind in ((True, True), (True, False), (False, True), (False, False))
+        )
+        return anytime_gap(Agreement(both, lost, gained, neither))
+
+    # Decided at this look, but not at the one before.
+    assert (gap(len(pairs)).low or 0.0) > 0.0
+    before = max(look for look in LOOKS if look < len(pairs))
+    assert (gap(before).low or 0.0) < 0.0
+    assert finding["estimate"]["low"] == pytest.approx(gap(len(pairs)).low)
+    for role in ("reference", "target"):
+        assert load(out / role).info.setup.injection.label.startswith("as if Raspberry Pi 4")
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"against": DEFAULT_POLICY}, f"--against {DEFAULT_POLICY}: accepted: another policy"),
+        (
+            {"against": "static-obstacles-ras-pi-4", "reference": "ras-pi-4"},
+            "left out with --reference",
+        ),
+        ({"against": "nobody"}, "nobody"),
         ({"episodes": 19}, "--episodes 19"),
         ({"require": "flight_time <= 20 s"}, "at least one least success rate"),
         ({"require": "success >= 100 %"}, "below 100 %"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from airl_mav.flight.requirements import (
     error_spent,
     plan_looks,
 )
+from airl_mav.flight.statistics import Agreement, Estimate, anytime_gap, wilson
 
 CAMPAIGNS, FLIGHTS = 20_000, 500
 
@@ -170,3 +172,107 @@ def test_a_borderline_rate_says_how_many_flights_it_would_take() -> None:
 def test_thresholds_that_no_flights_can_show(threshold: float) -> None:
     with pytest.raises(ValueError, match="threshold"):
         RateTest(threshold)
+
+
+def outcomes(threshold: float, rate: float) -> list[tuple[InterimAnalysis, int, float]]:
+    """Return every end of a campaign of at most 100 flights: look, failures, probability."""
+    ends, undecided, before = [], {0: 1.0}, 0
+    for look in plan_looks(threshold):
+        step = look.flights - before
+        new = stats.binom.pmf(np.arange(step + 1), step, 1.0 - rate)
+        reached: dict[int, float] = {}
+        for failures, chance in undecided.items():
+            for more, share in enumerate(new):
+                reached[failures + more] = reached.get(failures + more, 0.0) + chance * share
+        last = look.flights == 100
+        undecided, before = {}, look.flights
+        for failures, chance in reached.items():
+            decided = look.decide(failures) is not RequirementDecision.UNDECIDED
+            if decided or last:
+                ends.append((look, failures, chance))
+            else:
+                undecided[failures] = chance
+        if last:
+            return ends
+    raise AssertionError
+
+
+@functools.cache
+def estimate_at(threshold: float, look: InterimAnalysis, failures: int) -> Estimate:
+    """Return the estimate of a campaign that ended so; only its looks count."""
+    path = flown(look.flights, failures)
+    test = RateTest(threshold)
+    looks = list(plan_looks(threshold, [n for n in LOOKS if n <= look.flights]))
+    # The order of the flights: undecided at every look before the last one.
+    sums, before = [], 0
+    for each in looks[:-1]:
+        low = max(before, each.few + 1, failures - (look.flights - each.flights))
+        before = min(max(low, sum(not ok for ok in path[: each.flights])), each.many - 1, failures)
+        sums.append(before)
+    ends = [*zip([each.flights for each in looks[:-1]], sums, strict=True)]
+    ordered: list[bool] = []
+    for (n, k), (m, j) in itertools.pairwise([(0, 0), *ends, (look.flights, failures)]):
+        ordered += [False] * (j - k) + [True] * (m - n - (j - k))
+    return test.estimate(ordered)
+
+
+@pytest.mark.parametrize("threshold", [0.95, 0.8])
+def test_the_interval_covers_after_the_stop_where_wilsons_does_not(threshold: float) -> None:
+    """Summed over all campaigns, not simulated."""
+    rates = [threshold - 0.1, threshold - 0.05, threshold, threshold + 0.02]
+    wilsons = []
+    for rate in rates:
+        covered = by_wilson = total = 0.0
+        for look, failures, chance in outcomes(threshold, rate):
+            if chance < 1e-5:
+                continue
+            found = estimate_at(threshold, look, failures)
+            assert found.n == look.flights
+            assert found.value == pytest.approx(1.0 - failures / look.flights)
+            plain = wilson(look.flights - failures, look.flights)
+            total += chance
+            covered += chance * (found.low <= rate <= found.high)  # type: ignore[operator]
+            by_wilson += chance * (plain.low <= rate <= plain.high)  # type: ignore[operator]
+        assert total == pytest.approx(1.0, abs=2e-3)
+        assert covered >= 0.95
+        wilsons.append(by_wilson)
+    assert min(wilsons) < 0.93
+
+
+def test_the_interval_says_what_the_test_decides() -> None:
+    test = RateTest(0.95)
+    for rate in (0.5, 0.85, 0.9, 0.92, 0.94, 0.95, 0.96, 0.975, 0.99, 1.0):
+        for n in (0, 7, 20, 60, 100, 300, 500, 730):
+            path = flown(n, round((1.0 - rate) * n))
+            decision, found = test.decide(path), test.estimate(path)
+            if not n:
+                assert found.value is None
+                continue
+            if n < LOOKS[0]:
+                assert (found.n, found.low) == (n, None)
+                continue
+            assert found.n in LOOKS
+            assert found.low is not None
+            assert found.high is not None
+            assert found.low <= (found.value or 0.0) <= found.high
+            assert (found.low >= 0.95) == (decision is RequirementDecision.MET)
+            assert (found.high <= 0.95) == (decision is RequirementDecision.NOT_MET)
+
+
+def test_two_policies_that_are_alike_are_rarely_told_apart() -> None:
+    """Simulate pairs up to 500: one campaign in twenty may exclude the true gap at any look."""
+    rng = np.random.default_rng(11)
+    looks = [look for look in LOOKS if look <= FLIGHTS]
+    wrong, decided = 0, 0
+    for _ in range(120):
+        kinds = rng.choice(4, FLIGHTS, p=[0.82, 0.08, 0.08, 0.02])
+        for n in looks:
+            table = np.bincount(kinds[:n], minlength=4)
+            found = anytime_gap(Agreement(*map(int, table)))
+            if found.low > 0.0 or found.high < 0.0:  # type: ignore[operator]
+                wrong += 1
+                break
+        kinds = rng.choice(4, FLIGHTS, p=[0.80, 0.02, 0.16, 0.02])
+        decided += anytime_gap(Agreement(*map(int, np.bincount(kinds, minlength=4)))).low > 0.0  # type: ignore[operator]
+    assert wrong <= 0.05 * 120
+    assert decided > 0.95 * 120

@@ -11,8 +11,9 @@ from rich.console import Console
 
 from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.progress import DRAWING, Progress
+from airl_mav.flight.judge import Outcome
 from airl_mav.flight.requirements import Requirement, find, settle
-from airl_mav.flight.statistics import reached_goals
+from airl_mav.flight.statistics import anytime_gap, anytime_mean, reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import heatmap, measures, run_figures, run_verdict
 from airl_mav.report.comparison import (
@@ -45,10 +46,6 @@ from airl_mav.report.document import (
 
 Runs = Mapping[str, LoadedRun]
 
-FLOWN_UNTIL = "flown_until"
-"""Fact of a comparison with a sequential test, which stops once the success rate is decided. The
-same test judges the rate."""
-
 
 def build_comparison(
     folder: Path,
@@ -58,7 +55,23 @@ def build_comparison(
 ) -> tuple[comparison_model.Comparison, dict[str, LoadedRun]]:
     """Read the runs of a folder and compare them; the kind's module documents its facts."""
     loaded = {entry.name: load(folder / entry.folder) for entry in entries}
-    return _KINDS[kind][0](facts, entries, loaded), loaded
+    comparison = _KINDS[kind][0](facts, entries, loaded)
+    return _stopped(comparison) if comparison.stopped else comparison, loaded
+
+
+def _stopped(comparison: Comparison) -> Comparison:
+    """Return a comparison with intervals of success that hold although a decision ended it."""
+    runs, contrasts = [], []
+    for run in comparison.runs:
+        n = run.quality.success_rate.n
+        reached = run.quality.outcomes[Outcome.SUCCESS]
+        rate = anytime_mean([0.0, 1.0], [n - reached, reached])
+        runs.append(replace(run, quality=replace(run.quality, success_rate=rate)))
+    for contrast in comparison.contrasts:
+        paired = contrast.paired
+        change = replace(paired.success_rate, difference=anytime_gap(paired.agreement))
+        contrasts.append(replace(contrast, paired=replace(paired, success_rate=change)))
+    return replace(comparison, runs=tuple(runs), contrasts=tuple(contrasts))
 
 
 def rebuild_comparison(folder: Path) -> tuple[comparison_model.Comparison, dict[str, LoadedRun]]:
@@ -76,7 +89,8 @@ def judge_comparison(
     """Return the verdict of a comparison; raise FieldError for a required gap without a reference.
 
     The verdict on a hardware gap judges the run to deploy: the mitigated policy on the onboard
-    computer if flown, otherwise the policy. Other comparisons judge every run.
+    computer if flown, otherwise the policy. A sequential comparison judges the other run than the
+    reference. Other comparisons judge every run.
     """
     against = {c.entry.target: c for c in reversed(comparison.contrasts)}
     if not against and (gaps := [each for each in requirements if each.gap]):
@@ -94,7 +108,7 @@ def judge_comparison(
             None if contrast is None else contrast.paired,
             reference,
         )
-        if FLOWN_UNTIL in comparison.facts:
+        if comparison.stopped:
             reached = reached_goals(episodes)
             part = replace(part, findings=tuple(settle(each, reached) for each in part.findings))
         parts.append(part)
@@ -109,7 +123,7 @@ def judge_comparison(
 
 def _judged(comparison: comparison_model.Comparison) -> tuple[comparison_model.ComparedRun, ...]:
     if comparison.kind != "hardware-gap":
-        return comparison.runs
+        return comparison.runs[comparison.stopped :]
     judged = []
     for group in comparison.groups:
         roles = {run.entry.role: run for run in comparison.group(group)}
@@ -354,7 +368,7 @@ def trained_here(run: ComparedRun) -> bool:
 
 def _notes(runs: Sequence[ComparedRun], measure: measures.QualityMeasure) -> tuple[str, ...]:
     if measure is not measures.SUCCESS_RATE:
-        return ("Means over the flights that reached the goal, 95 % bootstrap intervals.",)
+        return ("Medians over the flights that reached the goal, with 95 % intervals.",)
     notes = ["Of all flights; 95 % intervals after Wilson. The same seeds in every cell."]
     if any(trained_here(run) for run in runs):
         notes.append("* the arena that the policy was trained in")
