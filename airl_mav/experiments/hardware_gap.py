@@ -376,7 +376,7 @@ def seek_verdict(
         / f"{utc_now():%Y%m%dT%H%M%SZ}-verdict-{experiment.file_name(declared.name)}"
     )
     check_folder(out, comparison_file(out, declared.kind).name)
-    for warning in experiment.known_seeds((target,)):
+    for warning in experiment.known_seeds((target, undelayed)):
         progress.note(warning, "yellow")
     with experiment.workers_of(scenario) as executor:
         fly = partial(_fly, out=out, progress=progress, executor=executor)

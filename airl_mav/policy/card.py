@@ -65,7 +65,7 @@ class Training(ProfileModel):
 
 
 class MeasuredResult(ProfileModel):
-    """Measured quality over a set of episodes; means over the successful ones."""
+    """Measured quality over a set of episodes; medians over the successful ones."""
 
     arena: str = Field(description="arena profile")
     level: Level = Field(description="fidelity level")
