@@ -74,7 +74,7 @@ def made_line(record: Record) -> str:
 def source_line(record: Record) -> str:
     """Return the file of a result, with a note if outdated."""
     stale = out_of_date(record)
-    means = " · means, but paired flight times are medians" if record.averages == "means" else ""
+    means = " · means" if record.averages == "means" else ""
     return f"`results/{record.name}.json`{means}" + (f" · **{stale}**" if stale else "")
 
 
