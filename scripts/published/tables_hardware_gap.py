@@ -42,8 +42,9 @@ def evidence(records: Records) -> str:
     level = next(iter(levels.gaps.values()))
     return (
         f"- At the decision latency of a Raspberry Pi 4 ({b.t2_ms:.0f} ms instead of "
-        f"{a.t2_ms:.0f} ms), success falls from {_success(a)} to {_success(b)} %: "
-        f"{_costs(late)}. Compensated in flight: {_success(compensated)} %, {_costs(mended)}.\n"
+        f"{a.t2_ms:.0f} ms), success falls from {_success(a)} to {_success(b)} %. "
+        f"Medians: {_costs(late)}. Compensated in flight: {_success(compensated)} %. "
+        f"Medians: {_costs(mended)}.\n"
         f"- The vectorized simulator and flights through MAVLink and MAVSDK differ by "
         f"{number(level.flight_time_s, 1, '+')} % in flight time on {level.flight_time_s.n} seeds."
     )
