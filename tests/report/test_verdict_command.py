@@ -172,7 +172,7 @@ def test_the_interval_beside_the_verdict_holds_after_the_stop(whole: tuple[Path,
 
 def test_two_policies_fly_until_their_gap_is_decided(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    options = {"policy": "static-obstacles-ras-pi-4", "against": "static-obstacles"}
+    options: dict[str, Any] = {"policy": "static-obstacles-ras-pi-4", "against": "static-obstacles"}
     code, text = verdict(out, **options)
     assert (code, said(out)["status"]) == (0, "met")
     (finding,) = said(out)["findings"]

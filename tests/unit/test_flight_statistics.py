@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -48,13 +49,14 @@ def coverage(draws: NDArray[np.float64], truth: float) -> float:
 def test_the_median_covers_skewed_times(n: int, kind: str) -> None:
     rng = np.random.default_rng(n)
     m = 1500
-    draws = {
+    kinds: dict[str, Callable[[], NDArray[np.float64]]] = {
         "lognormal": lambda: rng.lognormal(2.0, 0.6, (m, n)),
         "exponential": lambda: rng.exponential(8.0, (m, n)),
         "rare long flights": lambda: np.where(
             rng.random((m, n)) < 0.005, 90.0, rng.lognormal(2.0, 0.2, (m, n))
         ),
-    }[kind]()
+    }
+    draws = kinds[kind]()
     rare = 0.5 / 0.995
     truth = {
         "lognormal": math.exp(2.0),
