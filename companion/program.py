@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core import addons, constants, errors, machine, scheduling
+from airl_mav.core import addons, constants, errors, machine
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.flight.episode_record import Part, Setup
 from airl_mav.latency.injection import latency_generator
@@ -60,7 +60,6 @@ def prepare(asked: stand_alone.StandAloneCompanion) -> MissionSetup:
     settings, watchdog = checks.decide_piloting(asked, policy, model.PilotSettings.goal_radius_m)
     # Computing time of this computer counts, except in lockstep.
     injection = checks.select_latency(asked, policy, on_this_computer=not asked.lockstep)
-    checks.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
     loaded = checks.load_asked_policy(asked, policy, settings.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     # Obstacle messages need depth along the heading; other cameras are rejected before the flight.
@@ -213,7 +212,6 @@ def fly_alone(
 
     # Reverse order of closing: the link closes before the camera.
     with (
-        scheduling.held_to(asked.cpu_quota),
         closing(mission_camera(asked, mission, clock)) as camera,
         closing(open_link(asked, clock, abandon)) as link,
     ):
@@ -271,26 +269,24 @@ def check_on_ground(
     """Check a flight's requirements one by one, skipping absent parts, until `stop` is set."""
     clock = WallClock(asked.speed)
     yield CheckResult("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
-    # CPU quota as in flight, so that the timed decisions are representative.
-    with scheduling.held_to(asked.cpu_quota):
+    try:
+        camera = mission_camera(asked, mission, clock)
+    except errors.UsageError as error:
+        yield CheckResult("camera", False, str(error))
+        return
+    with closing(camera):
+        yield from look_at_camera(mission, camera, clock, stop)
+        # The newest frame serves as input for the timed decisions.
+        seen = camera.latest()
         try:
-            camera = mission_camera(asked, mission, clock)
-        except errors.UsageError as error:
-            yield CheckResult("camera", False, str(error))
-            return
-        with closing(camera):
-            yield from look_at_camera(mission, camera, clock, stop)
-            # The newest frame serves as input for the timed decisions.
-            seen = camera.latest()
-            try:
-                with closing(open_link(asked, clock, stop)) as link:
-                    link.connect(asked.connect_timeout, stop)
-                    link.check_alone(LISTEN_S)
-                    yield from look_at_vehicle(link, mission, stop)
-                    if seen is not None and not stop.is_set():
-                        yield time_decisions(mission, seen, link.kinematics())
-            except (LinkError, errors.UsageError) as error:
-                yield CheckResult("flight controller", False, str(error))
+            with closing(open_link(asked, clock, stop)) as link:
+                link.connect(asked.connect_timeout, stop)
+                link.check_alone(LISTEN_S)
+                yield from look_at_vehicle(link, mission, stop)
+                if seen is not None and not stop.is_set():
+                    yield time_decisions(mission, seen, link.kinematics())
+        except (LinkError, errors.UsageError) as error:
+            yield CheckResult("flight controller", False, str(error))
 
 
 def look_at_camera(

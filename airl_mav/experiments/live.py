@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from airl_mav.core import child_process, errors, first_start, scheduling
+from airl_mav.core import child_process, errors, first_start
 from airl_mav.core.progress import Progress
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
@@ -103,8 +103,6 @@ def fly_live(
         finally:
             live.close()
             folder.sweep()
-            if asked.cpu_quota is not None:
-                scheduling.remove_left()
         tell_end(folder.path, ended, problem, progress)
         new = live.finished_records
         episodes = tuple(sorted((*done, *new), key=lambda record: record.index))

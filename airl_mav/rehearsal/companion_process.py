@@ -15,7 +15,6 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
 from airl_mav.core.resource_use import UseMeter
-from airl_mav.core.scheduling import held_to
 from airl_mav.core.signing import camera_key
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.live_view import view_part
@@ -71,7 +70,6 @@ class MissionRunner:
         self._scenario.fresh_policy(aircraft.seed)  # loaded before the first flight
         compensator = self._scenario.compensator()
         with (
-            held_to(aircraft.cpu_quota),
             closing(open_camera(endpoint, clock, key)) as frames,
             closing(
                 MavsdkLink(

@@ -15,7 +15,6 @@ import numpy as np
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Goal
-from airl_mav.core.scheduling import check_permitted
 from airl_mav.faults import GYM, LINKS, Fault, check_gym
 from airl_mav.latency.injection import Injection, select_injection
 from airl_mav.policy import actions, registry
@@ -274,20 +273,6 @@ def check_goal_height(policy: registry.PolicyInfo, goal: Goal, field: str, asked
             asked,
             f"a goal with a height, which policy {policy.name} is told (its card's goal_height)",
         )
-
-
-def check_quota(asked: model.Decisions, injection: Injection, level: model.LevelName) -> None:
-    """Raise UsageError for a processor limit without effect, or without permission."""
-    if asked.cpu_quota is None:
-        return
-    if level != "sitl" or injection.latency is not None:
-        why = "an injected latency" if level == "sitl" else f"level {level}"
-        raise FieldError(
-            "cpu_quota",
-            asked.cpu_quota,
-            f"without {why}: only where the companion's own time counts",
-        )
-    check_permitted(asked.cpu_quota)
 
 
 def select_latency(

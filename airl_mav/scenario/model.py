@@ -198,14 +198,6 @@ class Decisions(Inference):
     """Policy settings and flight settings of its actions."""
 
     GROUP: ClassVar[str] = "policy"
-    cpu_quota: float | None = quantity(
-        "hold the companion to this share of one core, for real, by a Linux control group; what it"
-        " then takes is measured, nothing is injected",
-        "%",
-        ge=1,
-        le=6400,
-        default=None,
-    )
     hold_s: float | None = quantity(
         "hold time (t3) of an action before the next observation; by default that of the"
         " policy's card, or 0.5",

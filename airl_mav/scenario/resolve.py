@@ -109,7 +109,6 @@ def resolve(scenario: Scenario, policy: registry.PolicyInfo | None = None) -> Re
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
     camera.check_renderer(vehicle.camera, scenario.renderer, arena, further)
-    checks.check_quota(scenario, injection, scenario.level)
     resolved = ResolvedScenario(
         scenario=scenario,
         vehicle=vehicle,
@@ -132,12 +131,6 @@ def resolve(scenario: Scenario, policy: registry.PolicyInfo | None = None) -> Re
 
 def _labelled(injection: Injection, scenario: Scenario) -> Injection:
     """Return the latency with the label that the level's report uses."""
-    if scenario.cpu_quota is not None:
-        label = (
-            "native speed of the machine that flew, companion held to "
-            f"{scenario.cpu_quota:g} % of a core; nothing injected"
-        )
-        return replace(injection, label=label)
     if scenario.level == "sitl":
         return injection
     return without_timing(injection, checks.NATIVE_T2_US / 1e3, scenario.level)

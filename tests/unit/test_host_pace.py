@@ -91,7 +91,7 @@ def test_a_run_that_continues_is_not_asked_about(
 
 
 def test_what_lockstep_cannot_fly_gets_no_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
-    level, warning, _ = decided(monkeypatch, "--cpu-quota", "50", answer="y\n")
+    level, warning, _ = decided(monkeypatch, "--firmware", "ardupilot", answer="y\n")
     assert (level, "lockstep" in warning) == ("sitl", False)
 
 

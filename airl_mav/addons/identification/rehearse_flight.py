@@ -309,7 +309,6 @@ def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario
         "level": "lockstep",
         "latency": str(latencies),
         "time_limit_s": settings_of(box).limits.flight_s,
-        "cpu_quota": None,  # Recorded latencies include its effect.
     }
     return validated(Scenario, {**kept, **how, **given}, box.path)
 
