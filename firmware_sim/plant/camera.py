@@ -34,8 +34,8 @@ from airl_mav.core import constants, errors, scheduling
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.projections import Renderer
 from airl_mav.profiles.vehicle import SensorNoise
+from firmware_sim.engine.ticks import is_due
 from firmware_sim.interfaces import FirmwareLostError
-from firmware_sim.plant.sensors import Rate
 
 
 class _Eye:
@@ -163,7 +163,7 @@ class SimulatedCamera:
         """
         self._start_us = self.next_us = time_us
         """`next_us`: simulated time at which the next frame is due [µs]."""
-        self._rate = Rate(self._rate_hz)
+        self._schedule = np.array([self._rate_hz, 0.0, 0.0])
         for each in self._eyes.values():
             each.restart()
 
@@ -174,14 +174,14 @@ class SimulatedCamera:
     def skip_unread(self, read_us: int) -> None:
         """Skip due frames that newer ones replace before `read_us`; see `OnboardCamera`."""
         # The next frame is exposed at the first tick after its slot.
-        last_us = read_us - self._rate.period_us - constants.TICK_US
+        last_us = read_us - constants.US_PER_S / self._rate_hz - constants.TICK_US
         while self.next_us < last_us and not self._in_order:
             self._schedule_next(self.next_us)
 
     def _schedule_next(self, time_us: int) -> int:
         """Number the frame due at `time_us` [µs] and schedule the next; return the number."""
-        self._rate.due(time_us - self._start_us)
-        self.next_us = self._start_us + math.ceil(self._rate.next_us)
+        is_due(self._schedule, time_us - self._start_us)
+        self.next_us = self._start_us + math.ceil(self._schedule[1])
         self._sequence += 1
         return self._sequence - 1
 
@@ -196,7 +196,7 @@ class SimulatedCamera:
         access, unless an image depends on the previous one.
         """
         number = self._schedule_next(time_us)
-        seen = time_us - self._start_us, motion, self._seed, self._rate.period
+        seen = time_us - self._start_us, motion, self._seed, int(self._schedule[2])
 
         def draw() -> Mapping[str, FurtherImage]:
             return {name: each.take(*seen) for name, each in self._eyes.items()}

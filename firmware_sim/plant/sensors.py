@@ -11,7 +11,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core import constants, frames
 from airl_mav.profiles.vehicle import Sensors
 from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record, new_aircraft, new_sample
-from firmware_sim.engine.ticks import sense_record
+from firmware_sim.engine.ticks import is_due, sense_record
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 GPS_SATELLITES = 12
@@ -21,30 +21,6 @@ BLOCK = 128
 
 _WIDTHS = (12, 3, 2, 9)
 """White noise values per sample of accelerometer and gyro, compass, barometer, GPS."""
-
-
-class Rate:
-    """Schedule of a sensor slower than the tick, without drift."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._rate_hz = rate_hz
-        self.period_us = constants.US_PER_S / rate_hz
-        """Time between two samples [µs]."""
-        self.next_us = 0.0
-        """Simulated time of the next sample [µs]."""
-        self.period = 0
-        """Period number of the newest sample."""
-
-    def due(self, time_us: int) -> bool:
-        """Return True once per elapsed period."""
-        if time_us < self.next_us:
-            return False
-        period = int(time_us * self._rate_hz / constants.US_PER_S)
-        # Rounding may assign a time on a boundary to the period before.
-        if (period + 1) * constants.US_PER_S / self._rate_hz <= time_us:
-            period += 1
-        self.period, self.next_us = period, (period + 1) * constants.US_PER_S / self._rate_hz
-        return True
 
 
 class Site(NamedTuple):
@@ -69,7 +45,7 @@ class SimulatedSensor:
     def __init__(self, profile: Any, site: Site) -> None:
         """Store the sensor's model in a vehicle profile, with its `rate_hz`, and the site."""
         self.profile, self.site = profile, site
-        self.rate = Rate(profile.rate_hz)
+        self._schedule = np.array([profile.rate_hz, 0.0, 0.0])
         self._rows = np.zeros((0, self.noises))
         self._next = 0
 
@@ -81,13 +57,17 @@ class SimulatedSensor:
         self._next += 1
         return row
 
+    def due(self, time_us: int) -> bool:
+        """Return True once per period of the sensor."""
+        return is_due(self._schedule, time_us)
+
     def sense(self, time_us: int, row: frames.Vector, elapsed_us: int) -> Any:
         """Return the reading that is delivered after a tick at `time_us`; None = none.
 
         `row` (16,) is the motion of the vehicle (`engine.dynamics`), `elapsed_us` the time since
         the moving obstacles started [µs].
         """
-        return self.read(row, elapsed_us) if self.rate.due(time_us) else None
+        return self.read(row, elapsed_us) if self.due(time_us) else None
 
     def read(self, row: frames.Vector, elapsed_us: int) -> Any:
         """Return a reading in motion (16,), `elapsed_us` [µs] after the obstacles started."""

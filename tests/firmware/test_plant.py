@@ -21,10 +21,11 @@ from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft, PlantName
 from airl_mav.vehicle import atmosphere as wind_module
 from airl_mav.vehicle.atmosphere import Wind
 from firmware_sim.engine.dynamics import FORCE, POSITION, QUATERNION, VELOCITY
+from firmware_sim.engine.ticks import is_due
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
 from firmware_sim.plant.plant import Collision, Plant
-from firmware_sim.plant.sensors import Rate, SensorSuite
+from firmware_sim.plant.sensors import SensorSuite
 from tests.support.solo import SOLO
 
 G = 9.80665
@@ -599,8 +600,8 @@ def test_rates_of_the_quad_are_exact_over_ten_seconds(make: PlantMaker) -> None:
 @settings(max_examples=50)
 @given(rate_hz=st.floats(1.0, 250.0))
 def test_any_rate_is_kept_on_average(rate_hz: float) -> None:
-    rate = Rate(rate_hz)
-    due = [t for t in range(0, 10_000_000, TICK_US) if rate.due(t)]
+    schedule = np.array([rate_hz, 0.0, 0.0])
+    due = [t for t in range(0, 10_000_000, TICK_US) if is_due(schedule, t)]
     # Slot k is taken on the first tick at or after k periods.
     slots = {math.ceil(k * 1e6 / rate_hz / TICK_US) for k in range(math.ceil(10 * rate_hz) + 1)}
     assert len(due) == pytest.approx(len([s for s in slots if s < 2500]), abs=1)
@@ -610,8 +611,8 @@ def test_any_rate_is_kept_on_average(rate_hz: float) -> None:
 @pytest.mark.parametrize(("rate_hz", "count"), [(250.0, 2500), (33.0, 330), (15.0, 150)])
 @pytest.mark.parametrize("start_us", [0, 1_000_000_000])
 def test_rates_hold_from_any_start(rate_hz: float, count: int, start_us: int) -> None:
-    rate = Rate(rate_hz)
-    due = [t for t in range(start_us, start_us + 10_000_000, TICK_US) if rate.due(t)]
+    schedule = np.array([rate_hz, 0.0, 0.0])
+    due = [t for t in range(start_us, start_us + 10_000_000, TICK_US) if is_due(schedule, t)]
     assert due[0] == start_us
     assert len(due) == pytest.approx(count, abs=1 if start_us else 0)
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw
+from firmware_sim.engine.ticks import is_due
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.plant import Plant
-from firmware_sim.plant.sensors import Rate
 from tests.support.flight_rig import quad
 
 HOVER = quad().body.mass_kg * GRAVITY_M_S2 / (4 * quad().rotor.thrust_max_n)
@@ -68,8 +68,8 @@ def test_more_thrust_in_front_right_rolls_left_and_lifts_the_nose(plant: Plant) 
 @given(st.floats(1.0, 250.0), st.integers(0, 10_000_000))
 def test_any_rate_is_kept_without_drift(rate_hz: float, start: int) -> None:
     start -= start % TICK_US
-    rate = Rate(rate_hz)
-    times = [t for t in range(start, start + 4_000_000, TICK_US) if rate.due(t)]
+    schedule = np.array([rate_hz, 0.0, 0.0])
+    times = [t for t in range(start, start + 4_000_000, TICK_US) if is_due(schedule, t)]
     period = US_PER_S / rate_hz
     # The first one at once, the others in step with the period.
     assert len(times) == pytest.approx(4.0 * rate_hz, abs=2.01)
@@ -81,8 +81,8 @@ def test_any_rate_is_kept_without_drift(rate_hz: float, start: int) -> None:
 
 
 def test_a_rate_makes_nothing_up_for_a_pause() -> None:
-    rate = Rate(10.0)
-    assert rate.due(0)
-    assert rate.due(1_050_000)
-    assert not rate.due(1_098_000)
-    assert rate.due(1_100_000)
+    schedule = np.array([10.0, 0.0, 0.0])
+    assert is_due(schedule, 0)
+    assert is_due(schedule, 1_050_000)
+    assert not is_due(schedule, 1_098_000)
+    assert is_due(schedule, 1_100_000)

@@ -132,7 +132,7 @@ class PlantOpticalFlow(SimulatedSensor):
     def sense(self, time_us: int, row: Vector, elapsed_us: int) -> FlowReading | None:
         """Integrate the flow of every tick; see `SimulatedSensor`."""
         self.pass_tick(row)
-        return self.read(row, elapsed_us) if self.rate.due(time_us) else None
+        return self.read(row, elapsed_us) if self.due(time_us) else None
 
     def pass_tick(self, row: Vector) -> None:
         """Add a tick that ends in motion (16,)."""
@@ -178,7 +178,7 @@ class PlantVision(SimulatedSensor):
 
     def sense(self, time_us: int, row: Vector, elapsed_us: int) -> Odometry | None:
         """Return the pose that is due after its latency; see `SimulatedSensor`."""
-        if self.rate.due(time_us):
+        if self.due(time_us):
             delivered_us = time_us + self.profile.delay_s * US_PER_S
             self._late.append((delivered_us, self.read(row, elapsed_us)))
         return self._late.popleft()[1] if self._late and self._late[0][0] <= time_us else None
