@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -18,11 +15,10 @@ from airl_mav.cli import shared_options
 from airl_mav.cli.options import check_installed, run_command, scenario_of
 from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
-from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.projections import SLOW
-from airl_mav.rehearsal import host_pace, run_folder
+from airl_mav.rehearsal import host_pace
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
 from firmware_sim.external.programs import how_to_start
@@ -70,11 +66,12 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
     voice = shared_options.Voice(options, "airl-sitl", console)
     requirements = shared_options.requirements_of(options, reference=False)
     view = shared_options.view_of(options)
-    scenario, warning = on_this_host(resolve(scenario_of(options)), options, voice)
+    scenario = resolve(scenario_of(options))
+    warning = host_pace.host_warning(scenario.scenario)
     film = video_of(options, scenario.scenario, partial(_say, voice.console))
     with voice, film:
         if warning:
-            voice.progress.note(warning, "yellow")
+            voice.progress.note(f"{warning}; --level lockstep needs no real time", "yellow")
         flown = fly_live(
             scenario,
             options.out,
@@ -84,34 +81,6 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         )
         judged = conclude(flown, options, requirements, voice)
     return EXIT_CODES[flown.ended] or judged
-
-
-def on_this_host(
-    scenario: ResolvedScenario, options: SitlOptions, voice: shared_options.Voice
-) -> tuple[ResolvedScenario, str]:
-    """Return the scenario to fly, and a warning if this host does not keep real time.
-
-    A user at a terminal may choose level lockstep. Otherwise the flights begin after the warning.
-    """
-    if not (warning := host_pace.host_warning(scenario.scenario)):
-        return scenario, ""
-    try:
-        lockstep = resolve(scenario_of(options, level="lockstep"))
-    except UsageError:
-        return scenario, warning
-    known = options.out is not None and (options.out / run_folder.RUN_FILE).exists()
-    silent = options.quiet or options.json_lines
-    if known or silent or not (sys.stdin.isatty() and voice.console.is_terminal):
-        return scenario, f"{warning}. Without real time: {lockstep_command(sys.argv[1:])}"
-    _say(voice.console, warning)
-    question = "Fly at level lockstep instead: the same tables, without real time? [Y/n] "
-    return (scenario if voice.console.input(question).lower().startswith("n") else lockstep), ""
-
-
-def lockstep_command(words: Sequence[str]) -> str:
-    """Return the command line for the same flights at level lockstep, in a new run folder."""
-    given = re.sub(r"^sitl(?= |$)|--out[ =]('[^']*'|\S+)", "", shlex.join(words))
-    return " ".join(["airl-sitl", *given.split(), "--level lockstep"])
 
 
 def video_of(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 
-import numpy as np
 from rich.console import Console
 
 from airl_mav.addons.profiling.measurement import ROUND_TRIP, T1_UNCERTAINTY, ComputerMeasurement
@@ -14,9 +13,7 @@ from airl_mav.latency.stages import (
     MIN_SAMPLES,
     SHOWN_STAGES,
     Samples,
-    autocorrelation,
     corrected,
-    integrated_time,
     summarize,
 )
 from airl_mav.policy.card import PolicyCard
@@ -29,7 +26,6 @@ PERCENTILE_COLUMNS = (
     Column("duration", "ms", number=False),
     *(Column(title) for title in ("n", "mean", "p50", "p90", "p99", "p99.9", "max")),
 )
-LAGS = (1, 2, 3, 5, 10, 20, 50)
 
 PAPER_COMPUTER, PAPER_WORKLOAD = "ras-pi-4", "template-5x32"
 """The paper's gap: its onboard computer with its smallest policy."""
@@ -43,7 +39,6 @@ def print_measurement(measured: ComputerMeasurement, console: Console) -> None:
     print_table(_machine_table(measured), console, wrap=True)
     print_table(_stage_table(measured), console)
     print_table(_time_table(measured), console)
-    _say(console, correlation_line(measured.t2_us))
     for remark in measured.recording.remarks:
         _say(console, f"- {remark}")
     _say(console, verdict(measured.card, measured.t2_us), style="bold")
@@ -155,25 +150,6 @@ def _ms(value_us: float | None) -> str:
         return "-"
     value = value_us / US_PER_MS
     return f"{value:.3f}" if value < 10.0 else f"{value:.2f}" if value < 100.0 else f"{value:.1f}"
-
-
-def correlation_line(t2_us: Samples) -> str:
-    """Return a sentence on the autocorrelation of decision times."""
-    lags = [lag for lag in LAGS if lag < t2_us.size]
-    rho = autocorrelation(t2_us, lags[-1])
-    # The autocorrelation of independent samples stays below this in 95 %.
-    bound, time = 1.96 / np.sqrt(t2_us.size), integrated_time(t2_us)
-    values = ", ".join(f"{rho[lag]:+.2f} at {lag}" for lag in lags)
-    runs = float(np.abs(rho[1:4]).max()) > bound
-    meaning = (
-        "slow decisions come in runs: the order of the samples matters, and is replayed"
-        if runs
-        else "no more than of independent samples: their order hardly matters"
-    )
-    return (
-        f"autocorrelation of t2 by lag: {values} (independent: within ±{bound:.2f}); integrated "
-        f"time {time:.1f} decisions: {meaning}"
-    )
 
 
 def verdict(card: PolicyCard, t2_us: Samples) -> str:
