@@ -171,25 +171,6 @@ def watched(folder: Path) -> Iterator[Watched]:
     made.server.stop()
 
 
-def test_the_scene_glides_to_where_the_slider_is_dragged(watched: Watched) -> None:
-    page = watched.page
-    page.advance(0.0)
-    begun = page._seconds
-    page._slide_to(begun + 1.0)
-    page.advance(0.025)
-    assert page._seconds == pytest.approx(begun + 0.25)
-    page.advance(0.05)
-    assert page._seconds == pytest.approx(begun + 0.75)
-    page.advance(0.05)
-    assert page._seconds == begun + 1.0
-    page.advance(0.05)
-    assert page._seconds == begun + 1.0
-    page._slide_to(begun + 1.5)
-    page._go_to(begun)  # Jumping to another time ends it.
-    page.advance(0.05)
-    assert page._seconds == begun
-
-
 def test_the_page_plays_steps_and_shows_the_other_run(watched: Watched) -> None:
     page, node = watched.page, watched.node
     page.advance(0.0)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.addons.view.panel import NO_RETURN, camera_picture, numbers_html, texts_html
+from airl_mav.addons.view.panel import camera_picture, numbers_html, texts_html
 from airl_mav.addons.view.taps import Hand, HandCompensator, HandLatency
 from airl_mav.addons.view.view_messages import (
     STRIP_S,
@@ -47,6 +47,7 @@ from airl_mav.latency.injection import FixedSampler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.report.theme import NO_RETURN
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from tests.support.ports import free_ports
@@ -249,7 +250,7 @@ def test_near_is_bright_and_nothing_is_dark() -> None:
     picture = camera_picture(np.array([[0, 500, 9_000]], np.uint16), range_m=10.0)
     side = picture.shape[1] // 3
     nothing, near, far = picture[0, side // 2], picture[0, 3 * side // 2], picture[0, 5 * side // 2]
-    assert tuple(nothing) == NO_RETURN
+    assert "#{:02x}{:02x}{:02x}".format(*nothing) == NO_RETURN
     assert int(near.sum()) > int(far.sum()) + 100
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Iterable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -14,11 +13,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from airl_mav.addons.view.view_messages import STRIP_S, Decided, Image, Shown
-from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
-
-NO_RETURN = (38, 42, 48)
-"""Colour of pixels without a depth return."""
 
 LEAST_PX = 192
 """Minimum width of a displayed image [px]; narrower images are scaled by an integer."""
@@ -28,22 +23,12 @@ WARNING = 4
 NOTHING = "–"
 
 
-@cache
-def viridis() -> NDArray[np.uint8]:
-    """Return RGB (256, 3) from dark to bright."""
-    # Imported with the first image: the page is ready sooner without matplotlib.
-    from matplotlib import colormaps
-
-    return np.asarray(colormaps["viridis"](np.arange(256), bytes=True)[:, :3], np.uint8)
-
-
 def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
     """Return a `Frame.image` as RGB (h, w, 3); near depth is bright, up to `range_m` [m]."""
-    if image.ndim == 3:
-        picture = rgb_of(image)
-    else:
-        picture = viridis()[(255.0 * nearness(image, range_m)).astype(np.uint8)]
-        picture[image == 0] = NO_RETURN
+    # Imported with the first image: the page is ready sooner without matplotlib.
+    from airl_mav.report.theme import pictured
+
+    picture = pictured(image, range_m)
     times = max(1, math.ceil(LEAST_PX / picture.shape[1]))
     larger: NDArray[np.uint8] = np.kron(picture, np.ones((times, times, 1), np.uint8))
     return larger

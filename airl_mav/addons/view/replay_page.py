@@ -23,10 +23,6 @@ LATE_US = 500_000
 PANEL_S = 0.2
 """Period of updates of the panel and the camera's image [wall s]."""
 
-GLIDE_S = 0.1
-"""Duration of the transition to the slider's time [wall s]. A page without a GPU reports the
-slider every 0.09 s."""
-
 STEP_S = 0.02
 """Step of the slider [s], equal to the recording's period."""
 
@@ -68,11 +64,6 @@ class ReplayPage:
         self._since_panel_s = PANEL_S
         self._slid = False
         """True if a viewer moved the slider to the current time."""
-        self._slid_to_s = 0.0
-        """Target time of the slider [s]."""
-        self._glides_s = 0.0
-        """Remaining time of the transition to the slider's time [wall s]; 0 = no transition."""
-        self._drawn = 0
         self._other: replayed_flight.ReplayedFlight | None = None
         """Flight of the second run."""
         self._open(run.way(first or run.records[0]))
@@ -97,7 +88,8 @@ class ReplayPage:
         @self._time.on_update
         def _(event: Any) -> None:
             if event.client is not None:
-                self._slide_to(self._time.value)
+                self._playing = False
+                self._go_to(self._time.value, slid=True)
 
         @self._buttons.on_click
         def _(_event: object) -> None:
@@ -218,12 +210,6 @@ class ReplayPage:
     def _go_to(self, seconds: float, *, slid: bool = False) -> None:
         self._seconds = min(max(0.0, seconds), self._flight.duration_s)
         self._dirty, self._slid = True, slid
-        if not slid:
-            self._glides_s = 0.0
-
-    def _slide_to(self, seconds: float) -> None:
-        self._playing = False
-        self._slid_to_s, self._glides_s = seconds, GLIDE_S
 
     # --- drawing
 
@@ -244,13 +230,6 @@ class ReplayPage:
         if self._playing:
             self._go_to(self._seconds + wall_s * SPEEDS[self._speed.value])
             self._playing = self._seconds < self._flight.duration_s
-        elif self._glides_s > wall_s:
-            share = wall_s / self._glides_s
-            self._glides_s -= wall_s
-            self._go_to(self._seconds + share * (self._slid_to_s - self._seconds), slid=True)
-        elif self._glides_s > 0.0:
-            self._glides_s = 0.0
-            self._go_to(self._slid_to_s, slid=True)
         self._since_panel_s += wall_s
         due = self._since_panel_s >= PANEL_S
         if self._dirty:
@@ -263,7 +242,6 @@ class ReplayPage:
         """Draw the current time; with `panel`, including the panel."""
         self._dirty = False
         self._behind = True
-        self._drawn += 1
         self._flight.show(self._shown, self._seconds)
         self._scene.draw(self._shown, picture=False)
         if self._other is not None:
