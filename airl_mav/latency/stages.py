@@ -162,17 +162,6 @@ def ages_at_effect(stamps: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
     return known
 
 
-FENCE_RANGES = 3.0
-"""Interquartile ranges above the third quartile: Tukey's outer fence, beyond which a value is "far
-out" (Exploratory Data Analysis, 1977, section 2D)."""
-
-FENCE_SAMPLES = 16
-"""Minimum samples for a fence: with fewer, at most four lie beyond a quartile."""
-
-FENCE_SHARE = 0.05
-"""Share beyond the fence above which values are a second kind of decision, not outliers."""
-
-
 def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
     """Return the duration [µs] of each decision's stages (n,), `NO_STAMP` if unknown."""
     names = {name for stage in STAGES for name in (stage.start, stage.end)}
@@ -182,37 +171,6 @@ def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
         series[key] = np.full(n, NO_STAMP, np.int64)
         series[key][there] = durations
     return series
-
-
-@dataclass(frozen=True)
-class Fence:
-    """Outlier threshold."""
-
-    limit_us: float
-    """Maximum duration that is no outlier [µs]."""
-    beyond: int
-    """Number of durations above it."""
-    n: int
-    second_kind: bool
-    """True if too many lie above it for outliers: nothing is marked."""
-
-    def marks(self, durations: Samples) -> NDArray[np.bool_]:
-        """Return (k,) True for outliers among the durations (k,) [µs]."""
-        if self.second_kind:
-            return np.zeros(len(durations), np.bool_)
-        above: NDArray[np.bool_] = durations > self.limit_us
-        return above
-
-
-def fence(samples: Samples) -> Fence | None:
-    """Return Tukey's outer fence of durations (n,) [µs]; None with too few for quartiles."""
-    n = len(samples)
-    if n < FENCE_SAMPLES:
-        return None
-    low, high = np.percentile(samples, [25.0, 75.0])
-    limit = float(high + FENCE_RANGES * (high - low))
-    beyond = int(np.count_nonzero(samples > limit))
-    return Fence(limit, beyond, n, second_kind=beyond > FENCE_SHARE * n)
 
 
 MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 95.0: 130, 99.0: 662, 99.9: 6636}

@@ -311,8 +311,8 @@ class TableView:
     stacked: bool = False
     """True to print intervals in brackets below their values on a page, to save width."""
     in_terminal: Literal["whole", "stacked", "without intervals", "not"] = "whole"
-    links: Sequence[tuple[int, float | None]] = ()
-    """Flight and time of each row for links; time [s] from the start of navigation or None."""
+    links: Sequence[int] = ()
+    """Flight of each row, for links."""
 
 
 def ms(value_us: float | None, digits: int = 2) -> str:

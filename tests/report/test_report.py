@@ -18,7 +18,6 @@ from airl_mav.addons.forensics.worst import examine_worst
 from airl_mav.arena.geometry import Arena
 from airl_mav.flight.judge import Effect, Outcome
 from airl_mav.latency.injection import NOTHING_INJECTED
-from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import with_effects
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
@@ -38,7 +37,7 @@ from airl_mav.report.run_tables import (
 )
 from airl_mav.report.run_verdict import verdict_of
 from airl_mav.report.theme import DARK
-from airl_mav.report.timeline import slowest_table, timeline_of
+from airl_mav.report.timeline import timeline_of
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from tests.support.page_alone import page_alone, unpacked
@@ -359,7 +358,7 @@ def test_the_timeline_has_every_decision_in_order(
     t2 = np.concatenate([s["action_ready_us"] - s["infer_start_us"] for s in run.latency.values()])
     assert timeline.stages["t2"].tolist() == t2.tolist()
     first = len(run.latency[0]["sent_us"])
-    assert (timeline.flight_of(first - 1), timeline.flight_of(first)) == (0, 1)
+    assert timeline.starts[1] == first
 
 
 def test_the_age_of_the_flown_command_is_weighted_by_time(
@@ -380,24 +379,6 @@ def test_the_age_of_the_flown_command_is_weighted_by_time(
     row = cells(view, "at any moment, by time")
     assert float(row["mean"].replace(",", "")) == pytest.approx(every.mean() / 1e3, abs=1.0)
     assert float(row["p50"].replace(",", "")) == pytest.approx(np.median(every) / 1e3, abs=2.0)
-
-
-def test_decisions_that_stand_out_are_named(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
-    run, _ = demo
-    slow = {name: column.copy() for name, column in run.latency[1].items()}
-    for name in ("action_ready_us", "sent_us", "accepted_us", "motor_us"):
-        slow[name][3] += 5_000_000
-    timeline = timeline_of(replace(run, latency={**run.latency, 1: slow}))
-    found = slowest_table(timeline, SHOWN_STAGES)
-    assert found is not None
-    (row,), (place,) = found.rows, found.links
-    assert row[0] == "1"
-    assert row[4] == "t2 infer"
-    at_us = slow["capture_us"][3] - (run.episodes[1].navigation_us or 0)
-    assert row[1] == f"{at_us / 1e6:.2f}"
-    assert place[0] == 1
-    assert place[1] == pytest.approx(at_us / 1e6)
-    assert slowest_table(timeline_of(run), SHOWN_STAGES) is None
 
 
 def test_user_text_is_escaped(demo: tuple[LoadedRun, dict[int, Arena]], tmp_path: Path) -> None:

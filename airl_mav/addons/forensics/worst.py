@@ -312,7 +312,7 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> document.TableV
     ]
     if len(shown) < total:
         notes.append(f"The {len(shown)} worst of {total:,} flights.")
-    rows, links = tuple(map(_row, shown)), [(each.record.index, None) for each in shown]
+    rows, links = tuple(map(_row, shown)), [each.record.index for each in shown]
     return document.TableView("worst", "Worst flights", columns, rows, tuple(notes), links=links)
 
 

@@ -47,7 +47,7 @@
     clock.textContent = `${(now - view.navigation).toFixed(1)} s · ${speed[i].toFixed(1)} m/s`;
     seen.move(now - view.navigation);
   }
-  async function show(at) {
+  async function show() {
     stop();
     const number = Number(pick.value);
     view = views[number];
@@ -57,7 +57,7 @@
     clock.textContent = "";
     if (view.path) {
       [slider.min, slider.max] = [view.path.time[0], view.path.time[view.path.time.length - 1]];
-      now = at === undefined ? Number(slider.max) : at + view.navigation;
+      now = Number(slider.max);
       tell();
     }
     await tracks.show(flight, now - view.navigation);
@@ -87,7 +87,7 @@
   for (const link of document.querySelectorAll("[data-scene]")) {
     link.addEventListener("click", () => {
       pick.value = link.dataset.scene;
-      show(link.dataset.at === undefined ? undefined : Number(link.dataset.at));
+      show();
     });
   }
   await show();
