@@ -37,7 +37,7 @@ from firmware_sim.autopilot import autopilot_state, commander
 from firmware_sim.external import parameters, programs
 from firmware_sim.external.flight_stack import FirmwareRequest, real_firmware
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack, fly
-from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_device_links, bind_udp_links
+from firmware_sim.mavlink.px4_links import LinkConfig, UdpLinks, bind_gimbal_link, bind_udp_links
 from firmware_sim.mavlink.server import udp_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera import CameraServer
@@ -275,7 +275,7 @@ def fly_vehicle(
     def bind_devices() -> list[LinkConfig]:
         insecure = asked.insecure or asked.signing_key is not None
         host, instance = asked.companion_host, asked.real.instance
-        return bind_device_links(asked.bind, host, instance, insecure=insecure, say=ports.append)
+        return bind_gimbal_link(asked.bind, host, instance, insecure=insecure, say=ports.append)
 
     # Before binding ports, so that an arena error is reported first.
     episode, goal = episode_of(asked, vehicle, computer_w)

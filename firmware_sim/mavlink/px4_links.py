@@ -1,6 +1,6 @@
 """The links of PX4 SITL: default rates of their streams, and their UDP ports.
 
-Onboard API, ground station, payload and gimbal. The rates are measured on a real PX4 1.16 SITL. The
+Onboard API, ground station and gimbal. The rates are measured on a real PX4 1.16 SITL. The
 tables omit OPEN_DRONE_ID_*, EVENT and CURRENT_EVENT_SEQUENCE (see `texts_and_events`), and
 LINK_NODE_STATUS, whose counts depend on client timing and would change a flight's telemetry.
 Messages due in the same tick are sent in table order.
@@ -89,18 +89,6 @@ GCS_HZ = _table(
 )
 """Ground station link, 18570 -> 14550 [Hz]."""
 
-PAYLOAD_RATE = 0.1432
-"""Rate factor of the payload link, measured. PX4 limits this link to 4,000 bytes/s and slows all
-its streams down."""
-
-PAYLOAD_HZ: Mapping[str, float] = MappingProxyType(
-    {
-        name: hz if name in ("HEARTBEAT", "PING", "MISSION_CURRENT", "GPS_RAW_INT") else slowed
-        for name, hz, slowed in ((name, hz, hz * PAYLOAD_RATE) for name, hz in ONBOARD_HZ.items())
-    }
-)
-"""Payload link, 14280 -> 14030 [Hz]: PX4's onboard mode at reduced rates."""
-
 GIMBAL_HZ: Mapping[str, float] = MappingProxyType(
     {"HEARTBEAT": 1.0, "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": 20.0, "MISSION_CURRENT": 1.0}
 )
@@ -138,11 +126,6 @@ def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) ->
 def gcs_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the configuration of a ground station's link (PX4: 18570 -> 14550)."""
     return LinkConfig("gcs", endpoint, _rates(GCS_HZ, "gcs_hz"), separate_replies)
-
-
-def payload_link(endpoint: SharedEndpoint) -> LinkConfig:
-    """Return the configuration of a link to a camera or another payload (PX4: 14280 -> 14030)."""
-    return LinkConfig("payload", endpoint, PAYLOAD_HZ)
 
 
 def gimbal_link(endpoint: SharedEndpoint) -> LinkConfig:
@@ -191,36 +174,26 @@ def bind_udp_links(
     return UdpLinks(*ends)
 
 
-DEVICE_PORTS = {payload_link: (14280, 14030), gimbal_link: (13030, 13280)}
-"""Local and remote port of PX4 SITL's links to onboard devices, for instance 0."""
+GIMBAL_PORTS = 13030, 13280
+"""Local and remote port of PX4 SITL's link to a gimbal, for instance 0."""
 
 
-def bind_device_links(
+def bind_gimbal_link(
     bind: str, remote_host: str, instance: int, *, insecure: bool, say: Callable[[str], None]
 ) -> list[LinkConfig]:
-    """Bind the vehicle's ports of the payload link and the gimbal link.
-
-    A port in use is skipped and reported: few vehicles have a payload or a gimbal, and two vehicles
-    may share a host on custom ports.
+    """Bind the vehicle's port of the gimbal link; a port in use is skipped and reported.
 
     Raises:
         UsageError: An address is reachable from other machines without `insecure`.
     """
-    links: list[LinkConfig] = []
-    for link, ports in DEVICE_PORTS.items():
-        # As in PX4 SITL, each instance shifts all ports by its number.
-        local, remote = (port + instance for port in ports)
-        try:
-            ends = (bind, local), (remote_host, remote)
-            end = UdpEndpoint(*ends, "--instance", "--instance", insecure=insecure)
-        except PortTakenError:
-            say(f"UDP port {local} is taken: no {link.__name__.replace('_', ' ')}")
-            continue
-        except Exception:
-            # A usage error ends the program: release the ports bound so far.
-            for bound in links:
-                bound.endpoint.close()
-            raise
-        links.append(link(end))
-        say(f"{links[-1].name:<17} UDP port {remote} (from {local})")
-    return links
+    # As in PX4 SITL, each instance shifts all ports by its number.
+    local, remote = (port + instance for port in GIMBAL_PORTS)
+    ends = (bind, local), (remote_host, remote)
+    try:
+        end = UdpEndpoint(*ends, "--instance", "--instance", insecure=insecure)
+    except PortTakenError:
+        # Two vehicles may share a host on custom ports.
+        say(f"UDP port {local} is taken: no gimbal link")
+        return []
+    say(f"{'gimbal':<17} UDP port {remote} (from {local})")
+    return [gimbal_link(end)]

@@ -32,7 +32,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
-from firmware_sim.mavlink.px4_links import DEVICE_PORTS, gimbal_link
+from firmware_sim.mavlink.px4_links import GIMBAL_PORTS
 from firmware_sim.plant.camera import CameraServer
 from tests.support.command_line import airl
 from tests.support.ports import TestPorts, choose_ports
@@ -245,7 +245,7 @@ def test_only_a_rehearsal_with_a_socket_has_video() -> None:
 
 
 def test_the_port_is_that_of_the_link_for_a_gimbal() -> None:
-    assert DEVICE_PORTS[gimbal_link][1] == GIMBAL_PORT
+    assert GIMBAL_PORTS[1] == GIMBAL_PORT
     scenario = Scenario(firmware="px4")
     real = scenario.real.model_copy(update={"instance": 3})
     words = video_words(scenario.model_copy(update={"real": real}), "127.0.0.1:5600")
