@@ -397,7 +397,7 @@ def test_an_evasion_is_no_swinging() -> None:
     assert run[0] == 2
 
 
-def test_circling_standing_and_late_decisions() -> None:
+def test_circling() -> None:
     round_and_round = flight_of(
         [(0.0, 0.0, 0.0), (30.0, 6.0, 0.0)], heading_deg=[0.0, -4.0 * 360.0]
     )
@@ -406,17 +406,6 @@ def test_circling_standing_and_late_decisions() -> None:
     assert cause.kind == "circled"
     assert "4.0 times round to the left" in " ".join(cause.sentences)
 
-    stands = flight_of([(0.0, 0.0, 0.0), (4.0, 8.0, 0.0), (10.0, 8.0, 0.0), (15.0, 18.0, 0.0)])
-    record = record_of(stands, Outcome.SUCCESS, "1.99 m from the goal")
-    stood = cause_of(Evidence(record, stands, {}), USUAL_RUN)
-    assert stood.kind == "stood still"
-    assert "6.0 s, 40% of the time" in " ".join(stood.sentences)
-
-    stamps = stamps_of(stands)
-    keep = (stamps["capture_us"] < 4_000_000) | (stamps["capture_us"] > 9_000_000)
-    gap = cause_of(Evidence(record, stands, {k: v[keep] for k, v in stamps.items()}), USUAL_RUN)
-    assert "At 3.6 s no command came for 6.0 s; usual: 0.50 s" in " ".join(gap.sentences)
-
 
 def test_passing_the_goal_is_told_with_the_distance() -> None:
     past = flight_of([(0.0, 0.0, 0.0), (8.0, 20.0, 2.5), (12.0, 30.0, 2.5), (17.0, 21.0, 1.0)])
@@ -424,11 +413,6 @@ def test_passing_the_goal_is_told_with_the_distance() -> None:
     cause = cause_of(Evidence(record, past, {}), USUAL_RUN)
     assert "passed the goal at 2.5 m and left again" in " ".join(cause.sentences)
     assert cause.kind == "passed the goal"
-    straight = flight_of([(0.0, 0.0, 0.0), (30.0, 18.1, 0.0)])
-    record = record_of(straight, Outcome.SUCCESS, "1.90 m from the goal")
-    slow = cause_of(Evidence(record, straight, {}), USUAL_RUN)
-    assert slow.kind == "flew slowly"
-    assert "0.6 m/s; usual in this run: 2.5 m/s" in slow.sentences[0]
 
 
 def test_a_detour_is_one_with_or_without_need() -> None:
@@ -447,15 +431,8 @@ def test_a_usual_flight_has_no_cause_and_a_strange_one_none_made_up() -> None:
     away = flight_of([(0.0, 0.0, 0.0), (10.0, -25.0, 0.0)])
     lost = record_of(away, Outcome.TIMEOUT, "45.00 m from the goal after 10 s")
     assert cause_of(Evidence(lost, away, stamps_of(away)), USUAL_RUN).kind == NO_CAUSE
-    short = cause_of(Evidence(replace(lost, time_limit_s=5.0), away, {}), USUAL_RUN)
-    assert short.kind == "a time limit too short for the way"
-    # 18 m of straight way at 0.4 s for each.
-    assert "the way takes 7.2 s; the limit is 5 s" in short.sentences[-1]
     aborted = replace(lost, outcome=Outcome.ABORTED, reason="Ctrl-C")
     assert cause_of(Evidence(aborted, away, {}), USUAL_RUN).sentences == ("Ctrl-C.",)
-    empty = replace(lost, outcome=Outcome.BATTERY, reason="battery empty")
-    words = " ".join(cause_of(Evidence(empty, away, {}), USUAL_RUN).sentences)
-    assert "10 s at 450 W on average emptied the battery" in words
 
 
 def test_what_is_usual_and_what_was_lost() -> None:

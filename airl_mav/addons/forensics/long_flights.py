@@ -1,4 +1,4 @@
-"""Causes of timeouts and long flights: swings, stops, circles, missed goals, detours."""
+"""Causes of timeouts and long flights: swings, circles, missed goals, detours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena import geometry, placement
 from airl_mav.core import constants, frames
-from airl_mav.flight.episode_record import EpisodeRecord, UsualFlight, path_excess, straight_m
+from airl_mav.flight.episode_record import EpisodeRecord, path_excess
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
@@ -96,12 +96,6 @@ def _swings(
     return swings
 
 
-STILL_M_S = 0.2
-"""Speed below which the vehicle counts as stationary [m/s]."""
-
-STOOD_SHARE = 0.25
-"""Minimum share of stationary time for the cause "stood still"."""
-
 CIRCLES = 3.0
 """Minimum number of full turns in one direction for the cause "circled"."""
 
@@ -111,17 +105,11 @@ NEAR_MISS = 2.0
 MISS_M = 1.0
 """Minimum increase of the goal distance after a missed goal [m]."""
 
-PAUSE_PERIODS = 3.0
-"""Minimum gap between commands for a late decision, as a multiple of the median gap."""
-
-SLOW_SHARE = 0.15
-"""Minimum reduction of the mean speed for a slow flight, as a fraction of the median."""
-
 DETOUR_EXCESS = 0.25
 """Minimum excess over the straight line for a detour, as a fraction."""
 
 
-def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
+def cause_of_long_flight(flight: Evidence) -> Cause:
     """Return the cause of a long flight or of a missed goal."""
     record, path = flight.record, flight.path
     start_us = record.zero_us
@@ -133,19 +121,13 @@ def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
     findings = [
         _swinging(swing, start_us),
         _circling(part),
-        _standing(part),
-        _late_decision(flight.stamps, start_us, record.ended_us),
         _passed_goal(record, part, start_us),
         None if failed else _detour(flight),
-        None if failed else _slow_flight(record, usual),
-        _time_limit_too_short(record, usual),
     ]
     found = [finding for finding in findings if finding is not None]
     sentences = [sentence for cause in found for sentence in cause.sentences]
     if failed:
         sentences.insert(0, _approach(record, part, start_us))
-        if record.outcome is Outcome.BATTERY:
-            sentences.append(_power(part))
     return Cause(found[0].kind if found else NO_CAUSE, tuple(sentences))
 
 
@@ -185,30 +167,6 @@ def _circling(part: Trajectory) -> Cause | None:
     return Cause("circled", (f"It turned {abs(turns):.1f} times round to the {way}.",))
 
 
-def _standing(part: Trajectory) -> Cause | None:
-    steps_s = np.diff(part.time_us) / constants.US_PER_S
-    stood_s = float(steps_s[part.speed()[1:] < STILL_M_S].sum())
-    share = stood_s / float(steps_s.sum())
-    if share < STOOD_SHARE:
-        return None
-    return Cause("stood still", (f"It stood still for {stood_s:.1f} s, {share:.0%} of the time.",))
-
-
-def _late_decision(
-    stamps: Mapping[str, NDArray[Any]], start_us: int, ended_us: int
-) -> Cause | None:
-    sent = stamps.get("sent_us", np.zeros(0, np.int64))
-    times = sent[(sent != NO_STAMP) & (sent <= ended_us)]
-    gaps = np.diff(times)
-    if len(gaps) < 3 or gaps.max() < PAUSE_PERIODS * np.median(gaps):
-        return None
-    at = (times[int(gaps.argmax())] - start_us) / constants.US_PER_S
-    usual = np.median(gaps) / constants.US_PER_S
-    longest = gaps.max() / constants.US_PER_S
-    sentences = f"At {at:.1f} s no command came for {longest:.1f} s; usual: {usual:.2f} s."
-    return Cause("a decision was late", (sentences,))
-
-
 def _passed_goal(record: EpisodeRecord, part: Trajectory, start_us: int) -> Cause | None:
     away = _goal_distance(record, part)
     # Maximum distance still to come: a pass is a minimum with a clear increase after it.
@@ -237,32 +195,6 @@ def _detour(flight: Evidence) -> Cause | None:
     if free:
         return Cause("a detour without need", (f"{way}, on which nothing stood at the start.",))
     return Cause("a detour round obstacles", (f"{way}, which obstacles barred.",))
-
-
-def _slow_flight(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
-    if record.quality is None or usual.speed_m_s is None:
-        return None
-    speed = record.quality.mean_speed_m_s
-    if speed > (1.0 - SLOW_SHARE) * usual.speed_m_s:
-        return None
-    sentences = f"Mean speed {speed:.1f} m/s; usual in this run: {usual.speed_m_s:.1f} m/s."
-    return Cause("flew slowly", (sentences,))
-
-
-def _time_limit_too_short(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
-    if record.outcome is not Outcome.TIMEOUT or usual.pace_s_m is None:
-        return None
-    needs_s = usual.pace_s_m * straight_m(record)
-    if needs_s <= record.time_limit_s:
-        return None
-    limit = f"the limit is {record.time_limit_s:g} s"
-    sentences = f"At the usual pace the way takes {needs_s:.1f} s; {limit}."
-    return Cause("a time limit too short for the way", (sentences,))
-
-
-def _power(part: Trajectory) -> str:
-    time_s = (part.time_us[-1] - part.time_us[0]) / constants.US_PER_S
-    return f"{time_s:.0f} s at {part.power_w[1:].mean():.0f} W on average emptied the battery."
 
 
 HALF_WIDTH_M = 0.3

@@ -164,7 +164,7 @@ def cause_of(flight: long_flights.Evidence, usual: episode_record.UsualFlight) -
         return Cause(long_flights.NO_CAUSE, ())
     if outcome is Outcome.SUCCESS and not _slow(flight.record, usual):
         return Cause(USUAL, ())
-    return long_flights.cause_of_long_flight(flight, usual)
+    return long_flights.cause_of_long_flight(flight)
 
 
 def _slow(record: episode_record.EpisodeRecord, usual: episode_record.UsualFlight) -> bool:
