@@ -26,7 +26,6 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, arenas_of, flown_path, load, vehicle_of
 from airl_mav.report import document, plotly_scene, run_tables, tracking
 from airl_mav.report.document import Section, ms, tables_section
-from airl_mav.report.energy_section import energy_section
 from airl_mav.report.measures import RunSummary, conduct_table, rate_digits, summarize_run
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure, overview_picture
@@ -407,7 +406,6 @@ SECTIONS = (
         ),
     ),
     PageSection("latency", "Decision latency", latency_section),
-    PageSection("energy", "Energy", energy_section),
     PageSection("flights", "Flights", flights_section),
     PageSection("made", "How it was made", _provenance),
 )

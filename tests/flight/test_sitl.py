@@ -98,7 +98,7 @@ def test_folder_is_complete_and_nothing_else(done: Done) -> None:
     assert names == {
         *("run.json", "scenario.toml", "episodes.jsonl", "latency.npz", "trajectories.npz"),
         *("report.html", "verdict.json", "firmware.log", "companion.log"),
-        *("latency.png", "latency-timeline.png", "energy.png", "trajectories.png"),
+        *("latency.png", "latency-timeline.png", "trajectories.png"),
         *(
             f"{flight}{end}"
             for flight in flights

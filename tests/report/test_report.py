@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -22,7 +21,6 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import with_effects
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
 from airl_mav.report.document import TableView
-from airl_mav.report.energy_section import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.measures import conduct_table, summarize_run
 from airl_mav.report.plotly_scene import plotly_script
 from airl_mav.report.run_report import MAX_PICTURED, build_page
@@ -221,8 +219,8 @@ def test_the_page_is_one_file_that_reaches_nothing_else(page: str) -> None:
     assert "url(" not in style
     assert "@import" not in style
     assert all(image["alt"] for image in parsed.images)
-    # All flights; six stages that vary and their timeline, energy; two figures for each flight.
-    assert len(parsed.images) == 1 + 6 + 2 + 2 * 5
+    # All flights; six stages that vary and their timeline; two figures for each flight.
+    assert len(parsed.images) == 1 + 6 + 1 + 2 * 5
     named = {image["data-picture"] for image in parsed.images[1:]}
     assert named == set(json.loads(unpacked(script_of(page, "page-data")))["pictures"])
     inside = {ref[1:] for ref in parsed.references if ref.startswith("#")}
@@ -262,7 +260,7 @@ def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int
     run, _ = demo
     names = {path.name for path in run.path.glob("*.png")}
     expected = {f"flight-{i:03d}-{kind}.png" for i in range(5) for kind in ("map", "time")}
-    alone = {"latency.png", "latency-timeline.png", "energy.png", "trajectories.png"}
+    alone = {"latency.png", "latency-timeline.png", "trajectories.png"}
     assert names == expected | alone
     for name in names:
         with Image.open(run.path / name) as image:
@@ -312,26 +310,6 @@ def test_tables_have_medians_and_their_intervals(
     row = cells(quality_table(summarize_run(run)), "distance")
     assert row["value"] == f"{np.median([q.distance_m for q in good]):.2f} m"
     assert row["mean"] == f"{np.mean([q.distance_m for q in good]):.2f}"
-
-
-def test_the_energy_table_adds_up(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
-    run, _ = demo
-    energies = flight_energies(run, load_vehicle("quad"))
-    view = energy_table(energies)
-    kj = {row[0]: float(row[1]) for row in view.rows}
-    airframe = sum(e.quality.energy_j or math.nan for e in run.episodes if e.quality) / 1e3
-    assert kj["airframe"] == pytest.approx(airframe, abs=0.01)
-    parts = kj["– hovering"] + kj["– speed"] + kj["– manoeuvres"]
-    assert parts == pytest.approx(kj["airframe"], abs=0.03)
-    assert kj["together"] == pytest.approx(kj["airframe"] + kj["computer"], abs=0.02)
-    whole = energy_table(flight_energies(run, None))
-    assert [row[0] for row in whole.rows] == ["airframe", "computer", "together"]
-    listed = energy_flights_table(energies, 200)
-    for row in listed.rows:
-        quality = run.episodes[int(row[0])].quality
-        assert quality is not None and quality.energy_j is not None
-        parts = sum(float(cell) for cell in row[1:4])
-        assert parts == pytest.approx(quality.energy_j / 1e3, abs=0.02)
 
 
 def test_worst_flights_come_first_and_have_causes(
