@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
-from types import TracebackType
 from typing import IO, Any, ClassVar, TypedDict
 
 from rich.console import Console, RenderableType
@@ -142,12 +141,7 @@ class RichProgress(Progress):
             self._bars.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Remove the bars."""
         if self._console.is_interactive:
             self._bars.stop()

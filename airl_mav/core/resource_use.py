@@ -262,11 +262,6 @@ class ProcessUse:
     power_source: str
     """Source of the power, or the reason for a missing value."""
 
-    @property
-    def cores(self) -> float:
-        """Processor time by wall time: 1 is one fully used core."""
-        return self.cpu_s / self.wall_s if self.wall_s > 0.0 else 0.0
-
 
 class UseMeter:
     """Meter of the resource usage from `begin` to `end`."""

@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from types import TracebackType
 
 from airl_mav.core import constants, errors
 from airl_mav.core.clock import Patience, SimClock
@@ -278,12 +277,7 @@ class LockstepStage:
         self._partner.attach(self.link)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End the companion and release all resources."""
         self._open.close()
 

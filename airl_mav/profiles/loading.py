@@ -105,8 +105,6 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if len(above) > MOST_BASES:
         raise UsageError(f"{above[0]}: base: accepted: at most {MOST_BASES} below each other")
     data = read_toml(path)
-    if kind == "vehicles":
-        _name_power_model(data, path)
     if kind == "arenas":
         _anchor_files(data, path.parent.absolute())
     base = data.pop("base", None)
@@ -163,21 +161,6 @@ def _checked_files(value: object, table: str) -> Iterator[tuple[str, CheckedFile
                     yield from ((inner, file) for _, file in _checked_files(each, ""))
             else:
                 yield from _checked_files(field, inner)
-
-
-def _name_power_model(data: dict[str, Any], path: Path) -> None:
-    """Add the `model` field to a nine-coefficient table `power`, optional before version 0.3.
-
-    Raises UsageError for a `payload_g`, which is no longer part of the power model.
-    """
-    power = data.get("power")
-    if not isinstance(power, dict) or "b1_vxy" not in power or "model" in power:
-        return
-    power["model"] = "regression"
-    if power.pop("payload_g", 0.0):
-        raise UsageError(
-            f"{path}: power.payload_g: accepted: body.payload_kg, a part of mass_kg, in its place"
-        )
 
 
 _WHICH = ("model", "name")

@@ -55,7 +55,6 @@ class LoadEpisode(_Line):
     """Request to set up a new arena with the vehicle at rest; the autopilot boots."""
 
     type: Literal["load"] = "load"
-    episode: int
     seed: int
     """Seed of arena, sensors and wind."""
     tlog: str | None
@@ -77,7 +76,6 @@ class Fly(_Line):
     """Request to fly one mission."""
 
     type: Literal["fly"] = "fly"
-    episode: int
     goal: Goal
     """Goal: north, east [m] from the start."""
     epoch_ns: int | None
@@ -122,7 +120,6 @@ class Loaded(_Line):
     """Event: the episode is loaded, and the vehicle waits at the start."""
 
     type: Literal["loaded"] = "loaded"
-    episode: int
     time_us: int
     epoch_ns: int | None
     """Host monotonic time of simulated time 0; None without pacing."""
@@ -138,12 +135,9 @@ class State(_Line):
     time_us: int
     position: tuple[float, float, float]
     speed_m_s: float
-    yaw: float
     battery: float
     collision: str | None
-    mode: str
     armed: bool
-    landed: bool
     slipped_us: int
     """Simulated time skipped since the start because the host could not keep up [µs]."""
 
@@ -179,10 +173,6 @@ class Saved(_Line):
     """Event: the episode's arrays are on disk."""
 
     type: Literal["saved"] = "saved"
-    path: str
-    """Path of the arrays."""
-    sha256: dict[str, str] = Field(default_factory=dict)
-    """In lockstep, hashes of the flight by lane; see docs/explanation/lockstep.md."""
 
 
 class PhaseEntered(_Line):
@@ -199,14 +189,10 @@ class Ended(_Line):
     type: Literal["ended"] = "ended"
     reason: str
     notes: tuple[str, ...] = ()
-    path: str
-    """Path of the decision log."""
     by_hand: bool = False
     """True if the user changed latency or compensation during the flight."""
     use: ProcessUse | None = None
     """Resources used by the companion; None if it is not a separate process."""
-    sha256: dict[str, str] = Field(default_factory=dict)
-    """In lockstep, hashes of the policy's inputs; see docs/explanation/lockstep.md."""
 
 
 class Failed(_Line):

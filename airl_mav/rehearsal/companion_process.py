@@ -103,7 +103,6 @@ class MissionRunner:
                     channel.Ended(
                         reason=result.reason,
                         notes=result.notes,
-                        path=request.record,
                         by_hand=tap is not None and tap.touched,
                         use=used,
                     )

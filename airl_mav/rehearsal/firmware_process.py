@@ -20,7 +20,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import LOOPBACK, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import Geodetic, Goal, quat_yaw
+from airl_mav.core.frames import Geodetic, Goal
 from airl_mav.core.signing import StoredSigning, camera_key
 from airl_mav.faults import PROCESSES, Fault, link_fails
 from airl_mav.profiles.arena import ArenaSpec
@@ -176,7 +176,6 @@ class Service:
         self._record = Path(request.record)
         self._harness.send(
             channel.Loaded(
-                episode=request.episode,
                 time_us=loaded.time_us,
                 epoch_ns=loaded.epoch_ns,
                 slipped_us=self._firmware.slipped_us,
@@ -187,7 +186,7 @@ class Service:
     def _finish(self, _: channel.FinishEpisode) -> None:
         self._firmware.save(self._record)
         self._firmware.discard()
-        self._harness.send(channel.Saved(path=str(self._record)))
+        self._harness.send(channel.Saved())
 
     def _report(self, simulation: Simulation) -> None:
         if simulation.faults is not None:
@@ -352,12 +351,9 @@ def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0)
         time_us=truth.time_us,
         position=(x, y, z),
         speed_m_s=float(np.linalg.norm(truth.velocity)),
-        yaw=quat_yaw(truth.quaternion),
         battery=truth.battery_remaining,
         collision=collision,
-        mode=flight.mode.name.lower(),
         armed=flight.phase >= commander.FlightPhase.GROUND,
-        landed=flight.phase < commander.FlightPhase.AIR,
         slipped_us=slipped_us,
     )
 

@@ -138,7 +138,6 @@ class Rehearsal:
         pair.send(
             process_pair.FIRMWARE,
             channel.LoadEpisode(
-                episode=index,
                 seed=seed,
                 tlog=str(folder.tlog_path(index).absolute()),
                 record=str(record_path.absolute()),
@@ -157,7 +156,6 @@ class Rehearsal:
         pair.send(
             process_pair.COMPANION,
             channel.Fly(
-                episode=index,
                 goal=loaded.goal,
                 epoch_ns=loaded.epoch_ns,
                 seed=seed,

@@ -45,9 +45,6 @@ RATES = slice(10, 13)
 FORCE = slice(13, 16)
 """Specific force FRD [m/s²], as measured by an accelerometer."""
 
-POSE = slice(0, 10)
-"""Position, velocity and attitude, as stored in a trajectory."""
-
 
 @kernel
 def velocity(row: Vector) -> Vec:

@@ -64,12 +64,9 @@ def at(seconds: float, north: float = 0.0, **more: Any) -> Item:
         "time_us": START_US + round(seconds * 1e6),
         "position": (north, 0.0, -2.0),
         "speed_m_s": 0.0,
-        "yaw": 0.0,
         "battery": 1.0,
         "collision": None,
-        "mode": "offboard",
         "armed": True,
-        "landed": False,
         "slipped_us": 0,
     }
     return FIRMWARE, State(**(fields | more))
@@ -86,7 +83,7 @@ WARNED: Item = (
 
 
 def ended(reason: str = "goal reached", *notes: str) -> Item:
-    return COMPANION, Ended(reason=reason, notes=notes, path="")
+    return COMPANION, Ended(reason=reason, notes=notes)
 
 
 class Stage:
@@ -156,7 +153,6 @@ class FakeChild:
                 (
                     FIRMWARE,
                     Loaded(
-                        episode=request.episode,
                         time_us=START_US,
                         epoch_ns=0,
                         slipped_us=0,
@@ -175,7 +171,7 @@ class FakeChild:
             stage.put(*stage.on_abort(request))
         elif isinstance(request, FinishEpisode) and stage.saves:
             self.save()
-            stage.put((FIRMWARE, Saved(path=str(self.record))))
+            stage.put((FIRMWARE, Saved()))
 
     def save(self) -> None:
         stage = self.stage
@@ -536,7 +532,7 @@ def test_what_is_there_is_not_flown(play: Callable[..., Run]) -> None:
     run = play(FLOWN)
     (record,) = run.fly(3, done={0, 2})
     assert (record.index, record.seed) == (1, 6)
-    assert [request.episode for request in run.stage.requests(FIRMWARE, LoadEpisode)] == [1]
+    assert [request.seed for request in run.stage.requests(FIRMWARE, LoadEpisode)] == [6]
 
 
 def test_nothing_is_started_when_there_is_nothing_to_fly(play: Callable[..., Run]) -> None:

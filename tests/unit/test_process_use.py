@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from airl_mav.core.clock import SimClock, WallClock
-from airl_mav.core.resource_use import NO_SENSOR, ProcessUse, UseMeter
+from airl_mav.core.resource_use import NO_SENSOR, UseMeter
 from tests.unit.test_machine_power import ORIN_NX
 from tests.unit.test_machine_state import write
 
@@ -30,7 +30,6 @@ def test_processor_time_is_that_of_all_threads() -> None:
     by_psutil = after.user + after.system - before.user - before.system
     assert use.cpu_s == pytest.approx(by_psutil, abs=0.05)  # psutil counts in steps of 10 ms.
     assert use.cpu_s > 0.0
-    assert use.cores == pytest.approx(use.cpu_s / use.wall_s)
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux has it")
@@ -72,7 +71,3 @@ def test_power_is_measured_where_it_can_be_read(tmp_path: Path) -> None:
     assert use.power_w == pytest.approx(5.016 * 1.2)
     assert use.power_source == "INA monitor: VDD_IN"
     assert use.peak_memory_bytes is None
-
-
-def test_no_time_is_no_share() -> None:
-    assert ProcessUse(0.0, 0.0, None, "begin", None, "").cores == 0.0

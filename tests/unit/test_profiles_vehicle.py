@@ -24,7 +24,7 @@ from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.loading import Kind, list_profiles, load_profile, profiles_dir
 from airl_mav.profiles.parameters import SPECS, ParameterSpec, flown_values
-from airl_mav.profiles.vehicle import Momentum, Regression, VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import Momentum, VehicleProfile, load_vehicle
 from firmware_sim.autopilot.parameter_store import Parameters
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -568,39 +568,6 @@ def test_a_sensor_that_hardly_ever_samples_is_refused(tmp_path: Path) -> None:
 
 # --- power models
 
-OLD_POWER = """
-[power]
-b1_vxy = -1.526
-b2_axy = 3.934
-b3_vxy_axy = 0.968
-b4_vz = 18.125
-b5_az = 96.613
-b6_vz_az = -1.085
-b7_payload = 0.220
-b8_wind = 1.332
-b9_hover = 433.9
-payload_g = 0.0
-"""
-
-
-def test_a_table_of_coefficients_from_before_there_was_a_choice_is_a_regression(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "old.toml"
-    start, end = QUAD_TOML.index("[power]"), QUAD_TOML.index("[camera]")
-    for text in (
-        QUAD_TOML[:start] + OLD_POWER + QUAD_TOML[end:],
-        f'base = "quad"\n{OLD_POWER}',  # No field of the base's model is left.
-    ):
-        path.write_text(text)
-        power = load_profile("vehicles", str(path), VehicleProfile).power
-        assert isinstance(power, Regression)
-        assert (power.b1_vxy, power.b9_hover, power.bandwidth_hz) == (-1.526, 433.9, 1.0)
-    carried = OLD_POWER.replace("payload_g = 0.0", "payload_g = 200.0")
-    assert refusal(tmp_path, f'base = "quad"\n{carried}') == (
-        "power.payload_g: accepted: body.payload_kg, a part of mass_kg, in its place"
-    )
-
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
@@ -626,8 +593,23 @@ def test_a_wrong_power_model_is_refused_by_its_own_fields(
     assert refusal(tmp_path, QUAD_TOML.replace(old, new)) == message
 
 
+REGRESSION = """
+[power]
+model = "regression"
+b1_vxy = -1.526
+b2_axy = 3.934
+b3_vxy_axy = 0.968
+b4_vz = 18.125
+b5_az = 96.613
+b6_vz_az = -1.085
+b7_payload = 0.220
+b8_wind = 1.332
+b9_hover = 433.9
+"""
+
+
 def test_a_wrong_coefficient_is_refused_by_its_own_range(tmp_path: Path) -> None:
-    text = f'base = "quad"\n{OLD_POWER}'.replace("433.9", "-1.0")
+    text = f'base = "quad"\n{REGRESSION}'.replace("433.9", "-1.0")
     assert refusal(tmp_path, text) == "power.b9_hover = -1: accepted: 0 <= value <= 100000 W"
 
 

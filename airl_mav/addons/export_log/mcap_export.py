@@ -53,7 +53,7 @@ from airl_mav.black_box.messages import (
     text,
 )
 from airl_mav.core.clock import NS_PER_US, Clock, WallClock, since_1970_us
-from airl_mav.core.constants import LOOPBACK, US_PER_MS, US_PER_S
+from airl_mav.core.constants import LOOPBACK, US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replacing
 from airl_mav.core.frames import frd_to_flu, quat_flu_from_optical
@@ -179,7 +179,6 @@ def run_of(flight: RecordedFlight) -> dict[str, Any]:
     config = info.config
     pilot, limits = dict(config.get("pilot") or {}), dict(config.get("limits") or {})
     pilot["goal_radius_m"] = record.goal_radius_m
-    pilot.setdefault("hold_s", _hold_s(flight))
     limits["flight_s"] = record.time_limit_s
     told = {
         "goal": list(record.goal),
@@ -189,14 +188,6 @@ def run_of(flight: RecordedFlight) -> dict[str, Any]:
         "limits": limits,
     }
     return {**info_data(info), "config": {**config, **told}, "seeds": [record.seed]}
-
-
-def _hold_s(flight: RecordedFlight) -> float:
-    """Return the median hold time of actions [s], for older runs without this setting."""
-    columns = flight.decisions
-    if not len(columns.get("sent_us", ())):
-        return 0.0
-    return float(np.median(columns["held_until_us"] - columns["sent_us"])) / US_PER_S
 
 
 ENDED = "ended"

@@ -44,6 +44,9 @@ from airl_mav.report import document, theme
 if TYPE_CHECKING:
     from airl_mav.addons.roofline.roofline import RooflineRequest
 
+MISSION_M = 100.0
+"""Length of a mission, flown level at the safe velocity [m]."""
+
 Bound = Literal["body", "sensor", "computer", "hold", "link"]
 """Component that limits the speed."""
 
@@ -123,7 +126,6 @@ class Roofline(fields.ProfileModel):
     frame_rate_hz: float
     hold_s: float
     knee_share: float
-    mission_m: float
     draws: int
     seed: int
     points: tuple[RooflinePoint, ...]
@@ -189,7 +191,7 @@ def roofline_point(
         flown_m_s=greatest_speed(task, injection, t2_s, request.draws, request.seed),
         binds="body" if 1.0 / reaction >= knee_hz else max(parts, key=lambda part: parts[part]),
         power_w=power_w,
-        missions_per_charge=pack_j * measured / (power_w * request.mission_m),
+        missions_per_charge=pack_j * measured / (power_w * MISSION_M),
     )
 
 
@@ -365,7 +367,7 @@ def aircraft_table(found: Roofline) -> document.TableView:
         for point in found.points
     )
     notes = (
-        f"Missions: {found.mission_m:g} m each, on a full charge, level at the measured safe "
+        f"Missions: {MISSION_M:g} m each, on a full charge, level at the measured safe "
         "velocity; take-off, landing and manoeuvres come on top.",
     )
     return document.TableView("aircraft", "With the computer on board", columns, rows, notes)

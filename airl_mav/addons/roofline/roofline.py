@@ -71,13 +71,6 @@ class RooflineRequest(ProfileModel):
         le=1000,
         default=None,
     )
-    frame_rate_hz: float | None = quantity(
-        "frames of the camera a second; by default those of the vehicle's camera",
-        "Hz",
-        ge=1,
-        le=125,
-        default=None,
-    )
     hold_s: float | None = quantity(
         "t3: how long an action is held before the next observation; by default that of the"
         " policy's card, or 0.5",
@@ -88,9 +81,6 @@ class RooflineRequest(ProfileModel):
     )
     knee_share: float = quantity(
         "share of the roof at which the knee lies", "1", gt=0, lt=1, default=0.9
-    )
-    mission_m: float = quantity(
-        "length of a mission, flown level at the safe velocity", "m", gt=0, le=1e6, default=100.0
     )
     draws: int = quantity("flights at each speed that is tried", "1", ge=1, le=100_000, default=300)
     seed: int = quantity("of the latencies drawn", "1", ge=0, le=2**31, default=1)
@@ -142,7 +132,7 @@ def find_roofline(request: RooflineRequest) -> Roofline:
         raise FieldError(
             "policy", request.policy, "one that commands velocities, whose fastest is looked for"
         )
-    bare = _with_frame_rate(load_vehicle(request.vehicle), request.frame_rate_hz)
+    bare = load_vehicle(request.vehicle)
     noticed = () if request.sensing_distance_m is not None else _noticed(policy, bare, request)
     distance_m = request.sensing_distance_m or min(noticed)
     hold_s = request.hold_s
@@ -168,7 +158,7 @@ def find_roofline(request: RooflineRequest) -> Roofline:
     if not points:
         told = "; ".join(f"{each.computer}: {each.why}" for each in left_out)
         raise FieldError("computers", " ".join(request.computers), problem=told)
-    same = {"vehicle", "workload", "knee_share", "mission_m", "draws", "seed"}
+    same = {"vehicle", "workload", "knee_share", "draws", "seed"}
     return Roofline(
         policy=policy.name,
         sensing_distance_m=distance_m,
@@ -179,13 +169,6 @@ def find_roofline(request: RooflineRequest) -> Roofline:
         left_out=tuple(left_out),
         **request.model_dump(include=same),
     )
-
-
-def _with_frame_rate(vehicle: VehicleProfile, rate_hz: float | None) -> VehicleProfile:
-    if rate_hz is None:
-        return vehicle
-    camera = vehicle.camera.model_copy(update={"rate_hz": rate_hz})
-    return vehicle.model_copy(update={"camera": camera})
 
 
 def _noticed(
