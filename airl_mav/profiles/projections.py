@@ -222,10 +222,6 @@ class ProjectionModel:
         """Return the image velocity [px/s] of points (3, ...) with velocities `moves` [m/s]."""
         raise NotImplementedError
 
-    def finest(self, k: Intrinsics) -> float:  # noqa: ARG002 (of a fisheye)
-        """Return the maximum pixels per angle, relative to the focal length."""
-        return 1.0
-
     def angle_at(self, k: Intrinsics, side: float) -> float:
         """Return the angle from the optical axis [rad] at a distance from it in the image [px]."""
         return math.atan2(side, k.focal)
@@ -358,12 +354,6 @@ class Fisheye(ProjectionModel):
             on_axis = -dz / (z * z)
             changing = np.where(aside > _ON_AXIS, (opening - share * growing) / aside, on_axis)
             return f * (changing * x + share * dx), f * (changing * y + share * dy)
-
-    def finest(self, k: Intrinsics) -> float:
-        """Return the maximum pixels per angle, relative to the focal length."""
-        # The slope of the lens polynomial is sampled over half the field of view.
-        angles = np.linspace(0.0, min(0.5 * self.fov(k), sees_to(k.distortion)), 65)
-        return float(np.max(steepness(angles, k.distortion)))
 
     def angle_at(self, k: Intrinsics, side: float) -> float:
         """Return the angle from the optical axis [rad] at a distance from it in the image [px]."""

@@ -11,20 +11,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
-from scipy.spatial.transform import Rotation
 
-from airl_mav.addons.colour.appearance import linear_of, srgb_of
-from airl_mav.addons.colour.mitsuba import PathTracer, cube_of, resampled
+from airl_mav.addons.colour.mitsuba import PathTracer
 from airl_mav.addons.colour.picture import antialiased, render_picture
 from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_from_euler, quat_to_matrix
+from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from tests.support.lenses import BARREL
 from tests.support.meshes import kept, ring, scene_of, triangles
 
 pytest.importorskip("mitsuba")
@@ -229,81 +226,6 @@ def test_what_is_mirrored_and_seen_through_glass_is_theirs(surface: str) -> None
     assert off > 1.5 * apart, (off, apart)
 
 
-FISHEYES = [
-    Intrinsics.from_fov(72, 54, math.radians(170.0), "fisheye"),
-    Intrinsics.from_fov(72, 60, math.radians(190.0), "fisheye", distortion=BARREL),
-]
-ALL_ROUND = [
-    Intrinsics.from_fov(120, 40, 2.0 * math.pi, "cylindrical"),
-    # Looks up and down as well: through all faces.
-    Intrinsics.from_fov(60, 60, math.radians(200.0), "cylindrical"),
-]
-
-
-@pytest.mark.parametrize(
-    "camera", [*(pytest.param(each, marks=pytest.mark.nightly) for each in FISHEYES), *ALL_ROUND]
-)
-def test_cylinders_and_fisheyes_are_within_three_percent(camera: Intrinsics) -> None:
-    """Resampled from the faces of a cube: misplaced pixels would differ by shadows."""
-    scene = arena("dense-obstacles", 3, **LIGHT, **PLAIN)
-    inner, whole = difference(scene, (20.0, 5.0, -3.0), 2.2, camera=camera, rays=4)
-    assert inner < 0.03
-    assert whole < 0.04
-    # A lens that is a little wider is far off: the limits above can fail.
-    wider = replace(camera, focal=0.8 * camera.focal)
-    if camera.model.cylindrical and camera.horizontal_fov_rad > 6.0:
-        wider = replace(camera, cx=camera.cx + 8.0)
-    centers, place = scene.centers_at(0), np.array([20.0, 5.0, -3.0])
-    attitude = quat_from_euler(0.03, -0.08, 2.2)
-    theirs = path_traced(scene, centers, wider, place, attitude, samples=16)
-    other = antialiased(scene, centers, camera, place, attitude, 4)
-    assert float(np.abs(other.astype(float) - theirs).mean()) / 255.0 > 1.5 * whole
-
-
-@pytest.mark.nightly
-def test_a_face_of_the_cube_is_what_a_pinhole_sees() -> None:
-    """A pinhole is drawn as before; the same rays by faces give the same light but for noise."""
-    scene = arena("dense-obstacles", 3, **LIGHT, **PLAIN)
-    centers, place = scene.centers_at(0), np.array([0.0, 0.0, -2.5])
-    attitude = quat_from_euler(0.1, -0.2, 0.3)
-    flat = Intrinsics.from_fov(48, 36, 2.0)
-    direct = path_traced(scene, centers, flat, place, attitude, samples=64)
-    cube = cube_of(flat, 4)
-    assert 1 < len(cube.faces) < 6
-    assert sum(len(face.places) for face in cube.faces) == 16 * 48 * 36
-    rows = quat_to_matrix(attitude).T
-    images = []
-    for face in cube.faces:
-        # Each face as a separate pinhole, rotated and cropped.
-        turn = Rotation.from_matrix((face.axes @ rows).T).as_quat()
-        own = Intrinsics.from_fov(face.pixels, face.pixels, 0.5 * math.pi)
-        shown = path_traced(scene, centers, own, place, np.roll(turn, 1), samples=4)
-        part = shown[face.top : face.top + face.height, face.left : face.left + face.width]
-        images.append(linear_of(part / 255.0))
-    made = 255.0 * srgb_of(resampled(cube, images))
-    apart = np.abs(made - direct.astype(float)) / 255.0
-    assert apart.mean() < 0.02
-    assert np.quantile(apart, 0.9) < 0.05
-
-
-def test_the_same_seed_draws_the_same_bent_image() -> None:
-    scene, place = arena("no-obstacles", 0, **LIGHT, **PLAIN), np.array([0.0, 0.0, -2.5])
-    level = quat_from_euler(0.0, 0.0, 0.0)
-    drawn = [
-        path_traced(scene, scene.centers_at(0), FISHEYES[0], place, level, samples=4, seed=seed)
-        for seed in (5, 5, 6)
-    ]
-    np.testing.assert_array_equal(drawn[0], drawn[1])
-    assert (drawn[0] != drawn[2]).any()
-    blind: Any = ~replace(FISHEYES[1], width=90).rays.any(axis=0)
-    assert blind.any()
-    shown = path_traced(
-        scene, scene.centers_at(0), replace(FISHEYES[1], width=90), place, level, samples=4
-    )
-    assert not shown[blind].any()
-    assert shown[~blind].any(axis=-1).mean() > 0.99
-
-
 @pytest.mark.nightly
 @pytest.mark.timeout(600)  # Compiles kernels, on a busy machine for minutes.
 @pytest.mark.parametrize("material", [pytest.param("earth", marks=pytest.mark.nightly), "grass"])
@@ -325,3 +247,6 @@ def test_what_it_has_not_is_refused() -> None:
     place, level = np.array([0.0, 0.0, -2.5]), quat_from_euler(0, 0, 0)
     with pytest.raises(UsageError, match=r"without appearance\.fog"):
         path_traced(fog, fog.obstacles.center, CAMERA, place, level, samples=1)
+    clear, fisheye = arena("no-obstacles", 0), Intrinsics.from_fov(72, 54, 3.0, "fisheye")
+    with pytest.raises(UsageError, match="projection pinhole"):
+        path_traced(clear, clear.obstacles.center, fisheye, place, level, samples=1)

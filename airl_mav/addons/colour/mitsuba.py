@@ -1,17 +1,13 @@
 """Arenas and cameras as scenes of Mitsuba 3: path tracing, the reference of `picture`, without fog.
 
 Adds ambient occlusion and colour bleeding, which the fast renderer only averages below a ceiling.
-
-Mitsuba only has pinholes, so cylinders and fisheyes are resampled in linear light from pinhole
-images of a cube's faces. A pixel is divided into `side` x `side` samples. Each sample's ray leaves
-the cube through one face and takes the value of the nearest pixel there. Only faces with rays are
-rendered, and only the rectangle that the rays cover.
+Mitsuba only has pinholes: cameras of other projections are refused.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +17,7 @@ from airl_mav.addons.colour.picture import grey
 from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.addons.colour.textures import mean_of, periods, texels
 from airl_mav.arena import geometry, triangles
-from airl_mav.camera.intrinsics import Intrinsics, finer
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import RANGE_M
 from airl_mav.core import errors, frames
 from airl_mav.vehicle.rotation import Quat, Vec
@@ -43,12 +39,11 @@ class PathTracer:
     """Path-traced images; reuses the last scene while nothing in it moves."""
 
     def __init__(self, samples: int) -> None:
-        """Set the paths per pixel; approximate off the middle of a cylinder or fisheye."""
+        """Set the paths per pixel."""
         self._samples = samples
         self._arena: geometry.Arena | None = None
         self._centers: Floats = np.zeros((0, 3))
         self._scene: Any = None
-        self._cube: tuple[Intrinsics, Cube] | None = None
 
     def __call__(
         self,
@@ -61,10 +56,13 @@ class PathTracer:
     ) -> NDArray[np.uint8]:
         """Return the sRGB image of an arena; arguments as in `render.render`.
 
-        Raises UsageError for an arena with fog, ImportError without Mitsuba (the extra `render`).
+        Raises UsageError for an arena with fog or a camera other than a pinhole, ImportError
+        without Mitsuba (the extra `render`).
         """
         if arena.look.light.extinction > 0.0:
             raise errors.UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
+        if not intrinsics.model.planar:
+            raise errors.UsageError("renderer mitsuba: accepted: a camera of projection pinhole")
         import mitsuba as mi
 
         mi.set_variant(VARIANT)
@@ -75,56 +73,17 @@ class PathTracer:
             integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
             bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
             self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
-        axes, k = frames.quat_to_matrix(quaternion).T, intrinsics
-        if k.model.planar:
-            whole = _Film(k.width, k.height, 0, 0, k.width, k.height, k.horizontal_fov_rad)
-            light = self._rendered(mi, axes, position, whole, self._samples, seed)
-        else:
-            light = self._resampled(mi, k, axes, position, seed)
+        axes = frames.quat_to_matrix(quaternion).T
+        sensor = mi.load_dict(_sensor(mi, axes, position, intrinsics, self._samples))
+        light = np.array(mi.render(self._scene, sensor=sensor, seed=seed))[..., :3]
         encoded: NDArray[np.uint8] = np.rint(255.0 * appearance.srgb_of(light)).astype(np.uint8)
         return encoded
 
-    def _rendered(
-        self, mi: Any, axes: Floats, position: Floats, film: _Film, samples: int, seed: int
-    ) -> Floats:
-        """Return the light (h, w, 3) of a pinhole camera; axes (3, 3) forward, right, down."""
-        sensor = mi.load_dict(_sensor(mi, axes, position, film, samples))
-        return np.array(mi.render(self._scene, sensor=sensor, seed=seed))[..., :3]
 
-    def _resampled(
-        self, mi: Any, k: Intrinsics, axes: Floats, position: Floats, seed: int
-    ) -> Floats:
-        """Return the light (h, w, 3) of a cylinder or fisheye camera."""
-        side = side_for(k, self._samples)
-        if self._cube is None or self._cube[0] != k:
-            self._cube = k, cube_of(k, side)
-        cube = self._cube[1]
-        # The samples of a pixel share its paths.
-        samples = math.ceil(self._samples / (side * side))
-        images = []
-        for number, face in enumerate(cube.faces):
-            cut = (face.left, face.top, face.width, face.height)
-            film = _Film(face.pixels, face.pixels, *cut, 0.5 * math.pi)
-            # Each face of each image has a different seed.
-            own = (seed * len(FACES) + number) % _SEEDS
-            images.append(self._rendered(mi, face.axes @ axes, position, film, samples, own))
-        return resampled(cube, images)
-
-
-class _Film(NamedTuple):
-    """Image size of a pinhole, and its rendered part [px]."""
-
-    width: int
-    height: int
-    left: int
-    top: int
-    drawn_width: int
-    drawn_height: int
-    fov: float
-    """Horizontal field of view of the whole image [rad]."""
-
-
-def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) -> dict[str, Any]:
+def _sensor(
+    mi: Any, axes: Floats, position: Floats, camera: Intrinsics, samples: int
+) -> dict[str, Any]:
+    """Return a pinhole camera; axes (3, 3) forward, right, down."""
     forward, right, down = axes
     # Mitsuba's camera looks along +z; x points to the left of the image, y up.
     pose = np.eye(4)
@@ -132,18 +91,14 @@ def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) 
     return {
         "type": "perspective",
         "fov_axis": "x",
-        "fov": math.degrees(film.fov),
+        "fov": math.degrees(camera.horizontal_fov_rad),
         "near_clip": 0.001,
         "far_clip": 2.0 * RANGE_M,
         "to_world": mi.ScalarTransform4f(pose),
         "film": {
             "type": "hdrfilm",
-            "width": film.width,
-            "height": film.height,
-            "crop_offset_x": film.left,
-            "crop_offset_y": film.top,
-            "crop_width": film.drawn_width,
-            "crop_height": film.drawn_height,
+            "width": camera.width,
+            "height": camera.height,
             "rfilter": {"type": "box"},
             "pixel_format": "rgb",
         },
@@ -412,112 +367,6 @@ def _material(
         "to_uv": mi.ScalarTransform4f(place),
     }
     return _reflecting(finish, row, texture)
-
-
-FACES = tuple((axis, sign) for axis in range(3) for sign in (1.0, -1.0))
-"""Camera axis (forward, right, down) perpendicular to a face, and the side of the face."""
-
-MOST_SIDE = 4
-"""Maximum samples along each side of a pixel."""
-
-MOST_PLACES = 1 << 24
-"""Maximum samples of an image; the search takes about a hundred bytes for each sample."""
-
-
-class Face(NamedTuple):
-    """One face of the cube: the axes of its image, and the rendered part."""
-
-    axes: Floats
-    """(3, 3) rows forward, right, down of the face's camera, in the camera's axes forward, right,
-    down."""
-    pixels: int
-    """Pixels along each side of the whole face, a pinhole of 90 degrees."""
-    left: int
-    top: int
-    width: int
-    height: int
-    places: NDArray[np.intp]
-    """(n,) indices of the samples (h side, w side), flattened, that look through this face."""
-    source: NDArray[np.intp]
-    """(n,) pixel of the rendered part, flattened, for each sample."""
-
-
-class Cube(NamedTuple):
-    """Cube faces of an image and their mapping to pixels."""
-
-    shape: tuple[int, int]
-    """Rows and columns of the image."""
-    side: int
-    faces: tuple[Face, ...]
-
-
-def side_for(camera: Intrinsics, samples: int) -> int:
-    """Return the samples along each side of a pixel for a total number of samples."""
-    side = min(MOST_SIDE, math.isqrt(samples))
-    # Large images get fewer samples, because the search holds all of them in memory.
-    while side > 1 and side * side * camera.width * camera.height > MOST_PLACES:
-        side -= 1
-    return side
-
-
-def cube_of(camera: Intrinsics, side: int) -> Cube:
-    """Return the cube faces of a camera's image with side x side samples per pixel.
-
-    Faces are coarsest in the middle, where they match the resolution of the image's middle times
-    `side`. Around it a fisheye's image is finer, by half at 90 degrees.
-    """
-    k, fine = camera, finer(camera, side)
-    rays = fine.rays
-    # A pixel outside the field of view is entirely black.
-    blind = ~k.rays.any(axis=0)
-    rays[:, np.repeat(np.repeat(blind, side, axis=0), side, axis=1)] = 0.0
-    rays = rays.reshape(3, -1)
-    # A pinhole of 90 degrees is two focal lengths wide.
-    pixels = 2 * math.ceil(fine.focal * k.model.finest(k))
-    # A ray leaves the cube through the face of its largest component.
-    across = np.abs(rays).argmax(axis=0)
-    sees = rays.any(axis=0)
-    faces = []
-    for axis, sign in FACES:
-        places = np.flatnonzero(sees & (across == axis) & (sign * rays[axis] > 0.0))
-        if len(places):
-            faces.append(_cube_face(rays[:, places], places, axis, sign, pixels))
-    return Cube((k.height, k.width), side, tuple(faces))
-
-
-def resampled(cube: Cube, images: list[Floats]) -> Floats:
-    """Return the image (h, w, channels) from faces: mean of each pixel's samples, 0 without any."""
-    height, width = cube.shape
-    side, channels = cube.side, images[0].shape[-1] if images else 3
-    light = np.zeros((height * side * width * side, channels))
-    seen = np.zeros(len(light))
-    for face, image in zip(cube.faces, images, strict=True):
-        light[face.places] = image.reshape(-1, channels)[face.source]
-        seen[face.places] = 1.0
-    blocks = (height, side, width, side)
-    total = light.reshape(*blocks, channels).sum(axis=(1, 3))
-    count = seen.reshape(blocks).sum(axis=(1, 3))
-    mean: Floats = total / np.maximum(count, 1.0)[..., None]
-    return mean
-
-
-def _cube_face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, pixels: int) -> Face:
-    """Return the face for rays (3, n) of these samples."""
-    forward, right = np.zeros(3), np.zeros(3)
-    forward[axis] = sign
-    # The rotation about the optical axis is arbitrary.
-    right[(axis + 1) % 3] = 1.0
-    axes = np.stack([forward, right, np.cross(forward, right)])
-    ahead, aside, below = axes @ rays
-    # The ratios are in -1..1 on a face; the clip catches rays on its edge.
-    column, row = (
-        np.clip(((0.5 + 0.5 * part / ahead) * pixels).astype(np.intp), 0, pixels - 1)
-        for part in (aside, below)
-    )
-    left, top = int(column.min()), int(row.min())
-    width, height = int(column.max()) - left + 1, int(row.max()) - top + 1
-    source = (row - top) * width + column - left
-    return Face(axes, pixels, left, top, width, height, places, source)
 
 
 PATHS = 16

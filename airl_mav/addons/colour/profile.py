@@ -22,6 +22,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, optional, quantity, switch
 from airl_mav.core.streams import words_of
 from airl_mav.profiles.loading import CheckedFile
+from airl_mav.profiles.projections import PROJECTIONS
 
 if TYPE_CHECKING:
     from airl_mav.camera.render import Exposure
@@ -463,6 +464,8 @@ class PathTracing:
         accepted = None
         if camera.kind == "depth":
             accepted = "raycast with a depth camera; mitsuba draws colour"
+        elif not PROJECTIONS[camera.projection].planar:
+            accepted = f"raycast with a camera of projection {camera.projection!r}"
         elif camera.imaging is not None:
             accepted = "raycast with a camera that has a table imaging"
         elif arena.appearance.fog.drawn:
