@@ -405,5 +405,5 @@ def test_the_page_holds_every_cell_and_names_the_best_and_the_papers(
     # Opens offline.
     assert not re.findall(r"(?:src|href)=\"(?!data:)[^\"]+\"", page)
     assert ("t2, estimated" in page) == (computer is not None)
-    for file in ("sweep.md", "sweep-no-obstacles.png", "sweep-trade-off.png"):
+    for file in ("sweep.md", "sweep-no-obstacles.png"):
         assert (tmp_path / file).stat().st_size > 1000

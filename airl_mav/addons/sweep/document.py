@@ -7,15 +7,12 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from rich.console import Console
 
 from airl_mav.addons.sweep import summary
 from airl_mav.addons.sweep.config import SweepConfig, training_of, trials
-from airl_mav.report import document, heatmap, theme
+from airl_mav.report import document, heatmap
 from airl_mav.report.theme import FigureImage
 
 Described = tuple[document.Column, Callable[[summary.NetworkSummary], str]]
@@ -142,14 +139,7 @@ def _table(
     return document.TableView(key, title, tuple(column for column, _ in shown), rows, tuple(notes))
 
 
-ASIDE = 1.03
-"""Horizontal factor between the dots of one network in two arenas."""
-MARKERS = ("o", "s", "^", "D", "v")
-LABELLED = 20
-"""Maximum number of labelled networks in the trade-off; beyond, only each arena's best."""
-
-
-def success_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
+def success_pictures(sweep: summary.Sweep, arena: str) -> list[FigureImage]:
     """Draw the mean success rate of each network of an arena, with its standard deviation."""
     best = sweep.best(arena)
     known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
@@ -158,19 +148,21 @@ def success_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
         heatmap.Field(100.0 * rate, _success_text(cell), marked=cell is best)
         for cell, rate in zip(known, rates, strict=True)
     ]
-    heat = _heat_map(
-        sweep,
-        arena,
-        known,
-        fields,
+    grid = next(grid for grid in sweep.config.grids if grid.name == arena)
+    heat = heatmap.HeatMap(
         title=arena,
+        rows=grid.layers,
+        row_title="layers",
+        columns=grid.filters,
+        column_title="filters",
+        fields={(c.layers, c.filters): field for c, field in zip(known, fields, strict=True)},
         unit="success [%]",
         limits=(min(10.0 * math.floor(10.0 * min(rates, default=0.0)), 90.0), 100.0),
         note="success, mean ± std over training seeds [%]",
     )
     told = ", ".join(f"{cell.network} {percent(cell.success_rate.value)} %" for cell in known)
     alt = f"Success by layers and filters in {arena}: {told}"
-    return heatmap.heat_picture(f"sweep-{arena}", alt, heat)
+    return [heatmap.heat_picture(f"sweep-{arena}", alt, heat)]
 
 
 def _success_text(cell: summary.NetworkSummary) -> str:
@@ -182,130 +174,6 @@ def _success_text(cell: summary.NetworkSummary) -> str:
     return text
 
 
-def cost_picture(sweep: summary.Sweep, arena: str) -> theme.FigureImage:
-    """Draw the cost of each network: multiply-accumulates, or the latency estimated from them."""
-    cells = sweep.of(arena)
-    values = [_cost(sweep, cell) for cell in cells]
-    sizes = [f"{count(cell.macs)} MAC" for cell in cells]
-    if sweep.computer is not None:
-        title, unit = f"t2 on {sweep.computer.name}, estimated", "t2, estimated [ms]"
-        note = "from multiply-accumulates"
-        texts = [f"{t2_ms(value)} ms\n{size}" for value, size in zip(values, sizes, strict=True)]
-    else:
-        title, unit = "size", "multiply-accumulates"
-        note = "multiply-accumulates, parameters"
-        texts = [
-            f"{size}\n{count(cell.parameters)} par."
-            for cell, size in zip(cells, sizes, strict=True)
-        ]
-    heat = _heat_map(
-        sweep,
-        arena,
-        cells,
-        [heatmap.Field(value, text) for value, text in zip(values, texts, strict=True)],
-        title=title,
-        unit=unit,
-        limits=(min(values), max(max(values), 1.01 * min(values))),
-        note=note,
-        logarithmic=True,
-    )
-    alt = f"{heat.title} by layers and filters, {arena}"
-    return heatmap.heat_picture(f"sweep-size-{arena}", alt, heat)
-
-
-def _heat_map(
-    sweep: summary.Sweep,
-    arena: str,
-    cells: Sequence[summary.NetworkSummary],
-    fields: Sequence[heatmap.Field],
-    **look: Any,
-) -> heatmap.HeatMap:
-    """Return a heat map of some networks in the grid of an arena."""
-    grid = next(grid for grid in sweep.config.grids if grid.name == arena)
-    return heatmap.HeatMap(
-        rows=grid.layers,
-        row_title="layers",
-        columns=grid.filters,
-        column_title="filters",
-        fields={(c.layers, c.filters): field for c, field in zip(cells, fields, strict=True)},
-        **look,
-    )
-
-
-def _cost(sweep: summary.Sweep, cell: summary.NetworkSummary) -> float:
-    return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
-
-
-def trade_picture(sweep: summary.Sweep) -> theme.FigureImage:
-    """Draw success against cost: a dot with its interval for each network."""
-    figure = theme.new_figure(7.4, 4.2)
-    ax: Axes = figure.subplots()
-    known = {arena: [c for c in sweep.of(arena) if c.results] for arena in sweep.arenas}
-    many = sum(map(len, known.values())) > LABELLED
-    for number, (arena, cells) in enumerate(known.items()):
-        best = sweep.best(arena)
-        for cell in cells:
-            x = _cost(sweep, cell) * ASIDE ** (number - 0.5 * (len(known) - 1))
-            chosen = best is not None and cell.network == best.network
-            first = arena if cell is cells[0] else None
-            _draw_network(ax, cell, x, number, chosen=chosen, label=first)
-            if chosen or not many:
-                rise = 6 * (len(known) > 1) * (1 - number)
-                ax.annotate(
-                    cell.network,
-                    (x, 100.0 * (cell.success_rate.value or 0.0)),
-                    xytext=(8, rise),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8,
-                    color=theme.INK,
-                    zorder=4,
-                )
-    ax.set_xscale("log")
-    # Label every 1, 2 and 5: a grid spans hardly more than a decade.
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.xaxis.set_major_formatter(
-        FuncFormatter(lambda v, _: f"{v:g}" if sweep.computer is not None else count(v))
-    )
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    cost = "multiply-accumulates of an inference"
-    if sweep.computer is not None:
-        cost = f"t2 on {sweep.computer.name}, estimated from multiply-accumulates [ms]"
-    theme.label_axes(ax, cost, "success [%], 95 % interval", "What success costs")
-    ax.set_ylim(top=101.5)
-    theme.plain_axes(ax)
-    if len(sweep.arenas) > 1:
-        ax.legend(frameon=False, fontsize=8.5, labelcolor=theme.INK, loc="lower right")
-    return theme.render(figure, "sweep-trade-off", f"Success against {cost}, all networks")
-
-
-def _draw_network(
-    ax: Axes,
-    cell: summary.NetworkSummary,
-    x: float,
-    number: int,
-    *,
-    chosen: bool,
-    label: str | None,
-) -> None:
-    """Draw one network of an arena, styled by the arena's number."""
-    rate, colour = cell.success_rate, theme.line_style(number).colour
-    if rate.low is not None and rate.high is not None:
-        ends = [100.0 * rate.low, 100.0 * rate.high]
-        ax.plot([x, x], ends, color=colour, lw=1.4, alpha=0.55)
-    ax.plot(
-        x,
-        100.0 * (rate.value or 0.0),
-        MARKERS[number % len(MARKERS)],
-        ms=8 if chosen else 6,
-        color=colour,
-        mec=theme.MARK if chosen else theme.PAPER,
-        mew=1.8 if chosen else 0.8,
-        label=label,
-        zorder=3,
-    )
-
-
 def document_of(sweep: summary.Sweep) -> document.Document:
     """Return the page of a sweep with at least one finished trial."""
     sections = [
@@ -313,13 +181,10 @@ def document_of(sweep: summary.Sweep) -> document.Document:
             arena,
             sentences=best_sentences(sweep, arena),
             tables=(networks_table(sweep, arena),),
-            draw=partial(_arena_pictures, sweep, arena),
+            draw=partial(success_pictures, sweep, arena),
         )
         for arena in sweep.arenas
     ]
-    trade = document.Section(
-        "Success against cost", draw=lambda: [trade_picture(sweep)], in_terminal=False
-    )
     made = sweep.made
     begun = f"{made['created_utc']}".replace("T", " ").replace("+00:00", " UTC")
     return document.Document(
@@ -328,7 +193,7 @@ def document_of(sweep: summary.Sweep) -> document.Document:
         kicker=f"Architecture search · begun {begun} · {sweep.ended} of {sweep.planned} trials",
         lead="Templates of L convolutions x F filters, and as many dense layers of as many units.",
         headlines=tuple(_headline(sweep, arena) for arena in sweep.arenas),
-        sections=(*sections, trade),
+        sections=tuple(sections),
         facts=sweep_facts(sweep),
         facts_title="What was searched",
         provenance=(
@@ -344,10 +209,6 @@ def document_of(sweep: summary.Sweep) -> document.Document:
             "--policy trials/<trial>/policy"
         ),
     )
-
-
-def _arena_pictures(sweep: summary.Sweep, arena: str) -> list[FigureImage]:
-    return [success_picture(sweep, arena), cost_picture(sweep, arena)]
 
 
 def best_sentences(sweep: summary.Sweep, arena: str) -> tuple[str, ...]:
