@@ -339,9 +339,6 @@ def test_an_interrupted_soak_keeps_what_was_measured(tmp_path: Path) -> None:
         assert series["time_s"][-1] == facts["soak"]["duration_s"]
         assert (series["n"] >= 1).all()
         assert (series["p50_ms"] <= series["max_ms"]).all()
-    page = Path(f"{stem}.soak.html").read_text(encoding="utf-8")
-    assert "data:image/svg+xml" in page
-    assert "interrupted" in page
     # The measurement before the soak is whole, and flies.
     work = load_computer(str(tmp_path / "out/box.toml")).workloads[f"{DEFAULT_POLICY}-bare"]
     assert len(work.latency.samples_ms or ()) == 20

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from airl_mav.addons.profiling.soak import Soak, write_soak_page
+from airl_mav.addons.profiling.soak import Soak
 from airl_mav.core import clock, constants, errors, fields
 from airl_mav.core.files import save_arrays, write_json
 from airl_mav.core.machine import MachineState, package_versions
@@ -44,9 +43,6 @@ SCHEMA = 1
 
 ROUND_TRIP = "mavlink_round_trip"
 """Key of the TIMESYNC exchanges in flight."""
-
-PAGE_NEEDS = frozenset({"jinja2", "matplotlib"})
-"""Packages that draw the page of a soak, included in the [sim] extra."""
 
 T1_UNCERTAINTY = "t1_uncertainty"
 """Key of the maximum error of each decision's t1."""
@@ -170,16 +166,17 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
     by_file = LatencyDistribution(distribution="samples", samples_file=samples.name)
     written = workload.model_copy(update={"latency": by_file})
     title = f"t2 of {measured.card.name} on {profile.cpu}, {measured.network.runtime}, ms, in order"
-    more: tuple[Path, ...] = ()
+    paths: tuple[Path, ...] = (path, samples, arrays, facts)
     with errors.usage_errors(f"--out {path.parent}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         if measured.soak is not None:
-            more = _save_soak(measured, measured.soak, path.with_name(f"{stem}.soak.npz"))
+            paths = (*paths, path.with_name(f"{stem}.soak.npz"))
+            save_arrays(paths[-1], measured.soak.series)
         write_samples(samples, workload.latency.samples_ms or (), (title, workload.source))
         save_arrays(arrays, {**recording.columns, "flight": recording.flight_numbers})
         write_json(facts, _facts(measured, path.parent))
         write_profile(path, with_workload(profile, measured.workload, written))
-    return path, samples, arrays, facts, *more
+    return paths
 
 
 def share(measured: ComputerMeasurement, path: Path) -> Path:
@@ -202,25 +199,6 @@ def share(measured: ComputerMeasurement, path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_profile(path, profile)
     return path
-
-
-def _save_soak(measured: ComputerMeasurement, soaked: Soak, series: Path) -> tuple[Path, ...]:
-    """Write the series of a soak and, with the packages installed, its page; return both."""
-    save_arrays(series, soaked.series)
-    if not PAGE_NEEDS.issubset(name for name in PAGE_NEEDS if find_spec(name)):
-        return (series,)
-    facts = (
-        ("policy", measured.card.name),
-        ("network", measured.card.network),
-        ("processor", measured.profile.cpu),
-        ("runtime", measured.network.runtime),
-        ("power", measured.power.source),
-    )
-    title = f"{measured.card.name} on {measured.computer}"
-    page = write_soak_page(
-        soaked, series.parent, series.stem, title, facts, machine=measured.machine
-    )
-    return series, page
 
 
 def _facts(measured: ComputerMeasurement, out: Path) -> dict[str, Any]:

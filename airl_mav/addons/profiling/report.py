@@ -44,8 +44,6 @@ def print_measurement(measured: ComputerMeasurement, console: Console) -> None:
     _say(console, verdict(measured.card, measured.t2_us), style="bold")
     if measured.soak is not None:
         _say(console, measured.soak.sentence(), style="bold")
-        if measured.files and not any(path.suffix == ".html" for path in measured.files):
-            _say(console, "- the page of the soak is drawn by pip install 'airl-mav[sim]'")
     for path in measured.files:
         _say(console, f"written    {path}")
     if measured.files:
