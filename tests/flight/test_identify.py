@@ -355,8 +355,6 @@ def test_the_wind_turns_with_the_flight() -> None:
     ("words", "message"),
     [
         (["--parts"], "--parts True: accepted: with --identified"),
-        (["--workload", "flown"], "accepted: with --computer"),
-        (["--computer", "ras-pi-4", "--latency", "20ms"], "accepted: without --computer"),
         (["--parts", "--identified", "x", "--vehicle", "quad"], "accepted: without --parts"),
         (["--identified", "nowhere"], "no identification of a flight here"),
     ],

@@ -54,11 +54,6 @@ class Changes:
     vehicle: str | None = None
     wind: WindSettings | None = None
     """Wind in the flight's frame; None = calm."""
-    latency: str | None = None
-    """Latency as in `Scenario.latency`; None = the recorded latency of each decision."""
-    computer: str | None = None
-    """Computer whose latency replaces the flight's, with its workload; None = no replacement."""
-    workload: str | None = None
     prompt: bool = False
     """True disables injected latency: decisions take as long as on a desktop computer."""
 
@@ -239,15 +234,9 @@ def _first_yaw(episode: FlownEpisode) -> float:
 
 def _changed(changes: Changes, wind: WindSettings | None) -> dict[str, Any]:
     """Return changes as fields of a scenario."""
-    late: dict[str, Any] = {}
-    # The recorded latency must not be added to another one.
-    if changes.prompt or changes.computer is not None:
-        late = {"latency": None}
-    named = {"latency": changes.latency, "computer": changes.computer, "vehicle": changes.vehicle}
-    if changes.computer is not None:
-        named["workload"] = changes.workload
-    given = {name: value for name, value in named.items() if value is not None}
-    return {**late, **given, **({} if wind is None else {"wind": wind})}
+    late = {"latency": None} if changes.prompt else {}
+    aircraft = {} if changes.vehicle is None else {"vehicle": changes.vehicle}
+    return {**late, **aircraft, **({} if wind is None else {"wind": wind})}
 
 
 def distances(flown: Trajectory, rehearsed: Trajectory) -> NDArray[np.float64]:

@@ -71,18 +71,6 @@ class RehearseFlightOptions(ProfileModel):
         description="vehicle profile to rehearse: a shipped name, or a path to a .toml; by default"
         " that of the identification, or the one that the flight names",
     )
-    latency: str | None = Field(
-        default=None,
-        description="latency t2 to rehearse, as airl-sitl takes it; by default that of the flight,"
-        " decision by decision",
-    )
-    computer: str | None = Field(
-        default=None,
-        description="computer profile whose latency is rehearsed in the place of the flight's",
-    )
-    workload: str | None = Field(
-        default=None, description="workload of that computer profile, as airl-sitl takes it"
-    )
     trust: bool = Field(default=False, description="run code that the policy or the arena names")
     out: Path | None = Field(
         default=None,
@@ -153,14 +141,9 @@ def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
 def _check(options: RehearseFlightOptions) -> None:
     if options.parts and options.identified is None:
         raise FieldError("parts", options.parts, "with --identified")
-    if options.workload is not None and options.computer is None:
-        raise FieldError("workload", options.workload, "with --computer")
-    if options.computer is not None and options.latency is not None:
-        raise FieldError("latency", options.latency, "without --computer")
-    if options.parts:
-        for name in ("vehicle", "latency", "computer"):
-            if (value := getattr(options, name)) is not None:
-                raise FieldError(name, value, "without --parts, which flies the identified values")
+    if options.parts and options.vehicle is not None:
+        accepted = "without --parts, which flies the identified values"
+        raise FieldError("vehicle", options.vehicle, accepted)
 
 
 def _changes(options: RehearseFlightOptions) -> Changes:
@@ -171,10 +154,4 @@ def _changes(options: RehearseFlightOptions) -> Changes:
     if options.identified is not None:
         check_installed("identify")
         changes = changes_of(options.identified)
-    return replace(
-        changes,
-        vehicle=options.vehicle or changes.vehicle,
-        latency=options.latency,
-        computer=options.computer,
-        workload=options.workload,
-    )
+    return replace(changes, vehicle=options.vehicle or changes.vehicle)
