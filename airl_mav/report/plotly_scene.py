@@ -21,17 +21,10 @@ from airl_mav.core import constants, frames
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.rehearsal.run_folder import LoadedRun, flown_path
 from airl_mav.report import document, run_figures, scene
 
 POINTS = 240
 """Maximum number of points of a path."""
-
-ALL_POINTS = 40
-"""Maximum number of points of a path in the view of all flights."""
-
-ALL_FLIGHTS = 150
-"""Maximum number of flights in the common view, failed flights preferred."""
 
 CORNERS = 12
 """Number of corners of a drawn circle."""
@@ -64,19 +57,10 @@ class SceneFlight:
     arena: Arena | None
 
 
-def scene_json(
-    run: LoadedRun,
-    flights: Sequence[SceneFlight],
-    everyone: Sequence[EpisodeRecord],
-    fov_deg: float,
-) -> str:
-    """Return the views of each flight and, for two or more, of `everyone` as JSON."""
+def scene_json(flights: Sequence[SceneFlight], fov_deg: float) -> str:
+    """Return the view of each flight as JSON."""
     top = top_speed(flights)
     views = [flight_view(flight, top, fov_deg) for flight in flights]
-    if len(everyone) > 1:
-        shared = len({(e.arena, e.arena_seed) for e in run.episodes}) == 1
-        arena = next((flight.arena for flight in flights), None)
-        views.append(all_flights_view(run, everyone, arena, shared=shared))
     text = json.dumps(views, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c")
 
@@ -95,7 +79,7 @@ def plotly_script() -> str:
 def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, Any]:
     """Return a flight's figure and slider data; `top` [m/s] is the upper end of the colours."""
     record, arena = flight.record, flight.arena
-    path = _thinned(flight.path, POINTS)
+    path = _thinned(flight.path)
     place, speed = _east_north_up(path.position), path.speed()
     ground = None if arena is None else arena.ground
     below = np.zeros(len(place)) if ground is None else ground.heights_at(path.position)
@@ -182,32 +166,6 @@ def _view(fov_deg: float) -> list[float]:
     return [VIEW_M if fov_deg else 0.0, round(math.radians(fov_deg) / 2.0, 3)]
 
 
-def all_flights_view(
-    run: LoadedRun, everyone: Sequence[EpisodeRecord], arena: Arena | None, *, shared: bool
-) -> dict[str, Any]:
-    """Return the common view, coloured by outcome; obstacles only if the arena is `shared`."""
-    traces = [] if arena is None else _arena_traces(arena, obstacles=shared)
-    for outcome in run_figures.OUTCOME_COLOURS:
-        records = [record for record in everyone if record.outcome is outcome]
-        paths = [
-            path for r in records if (path := flown_path(run, r)) is not None and len(path) > 1
-        ]
-        if not paths:
-            continue
-        thinned = [_east_north_up(_thinned(path, ALL_POINTS).position) for path in paths]
-        # Gaps between paths allow one line for all of them.
-        joined = [part for places in thinned for part in (*_rounded(places), [None] * 3)]
-        label = f"{document.OUTCOME_LABELS[outcome]} ({len(records)})"
-        line = _line(np.zeros((0, 3)), run_figures.OUTCOME_COLOURS[outcome], label, width=3)
-        line |= {axis: [part[k] for part in joined] for k, axis in enumerate("xyz")}
-        traces.append(line | {"showlegend": True})
-        if outcome is not Outcome.SUCCESS:
-            ends = np.stack([places[-1] for places in thinned])
-            traces.append(_marks(ends, run_figures.OUTCOME_COLOURS[outcome], label, symbol="x"))
-    traces.append(_marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"))
-    return {"figure": {"data": traces, "layout": _layout()}, "path": None}
-
-
 def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDArray[np.int64]]:
     """Return obstacle i at a centre NED [m] as a closed mesh: corners ENU [m] and triangles."""
     half, yaw = obstacles.half_size[i], float(obstacles.yaw[i])
@@ -242,7 +200,7 @@ def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDA
     return _east_north_up(placed), np.array(triangles)
 
 
-def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
+def _arena_traces(arena: Arena) -> list[Trace]:
     b = arena.bounds
     corners = [
         (b.east_min, b.north_min),
@@ -262,7 +220,7 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         _mesh([(floor, np.array([(0, 1, 2), (0, 2, 3)]))], "#c9cdd2", "floor", opacity=0.45),
         _mesh([(walls, np.array(faces))], f"rgb({red},{green},{blue})", "wall", opacity=0.12),
     ]
-    if arena.ground is not None and obstacles:
+    if arena.ground is not None:
         hills = arena.ground.coarser(MOST_CELLS)
         body = (_east_north_up(hills.points), hills.faces.astype(np.int64))
         low, high = HILLS_COLOURS
@@ -273,7 +231,7 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
             "flatshading": False,
         }
         traces.append(_mesh([body], low, "ground") | shades)
-    if obstacles and arena.n_static:
+    if arena.n_static:
         shown = drawn(arena.meshes, MOST_TRIANGLES)
         bodies = {
             i: body_mesh(arena.obstacles, i, arena.obstacles.center[i])
@@ -321,7 +279,6 @@ def _line(points: Floats, colour: str, name: str, *, width: float) -> Trace:
         "line": {"color": colour, "width": width},
         "name": name,
         "hoverinfo": "name",
-        "showlegend": False,
     }
 
 
@@ -351,8 +308,7 @@ def _layout() -> dict[str, Any]:
     return {
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "paper_bgcolor": "rgba(0,0,0,0)",
-        "showlegend": True,
-        "legend": {"x": 0.0, "y": 0.0},
+        "showlegend": False,
         "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#5c646e", "activecolor": "#2f7fc4"},
         "scene": {
             **axes,
@@ -372,9 +328,9 @@ def _camera(eye: tuple[float, float, float]) -> dict[str, dict[str, float]]:
     return {name: dict(zip("xyz", place, strict=True)) for name, place in places.items()}
 
 
-def _thinned(path: Trajectory, points: int) -> Trajectory:
-    """Return up to `points` samples, evenly spaced, including the first and the last."""
-    keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), points)).round().astype(int))
+def _thinned(path: Trajectory) -> Trajectory:
+    """Return up to `POINTS` samples, evenly spaced, including the first and the last."""
+    keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), POINTS)).round().astype(int))
     return Trajectory.from_arrays({name: array[keep] for name, array in path.arrays().items()})
 
 

@@ -263,8 +263,7 @@ def by_flight_section(page: ReportInput) -> tuple[Section, ...]:
     if asked:
         chosen_again = f"{sum(asked):,} of {len(asked):,} decisions"
         note += f" The policy, asked again, chose the flown action in {chosen_again}."
-    data = {"together": min(len(page.run.episodes), plotly_scene.ALL_FLIGHTS), "best": BEST}
-    section = Section("Flight by flight", note=note, template="by_flight.html.j2", data=data)
+    section = Section("Flight by flight", note=note, template="by_flight.html.j2", data=BEST)
     return (section,) if page.view else ()
 
 
@@ -297,7 +296,6 @@ def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
     fov, range_m = (0.0, 0.0) if vehicle is None else (
         vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
     )  # fmt: skip
-    everyone = ranked(run.episodes)[: plotly_scene.ALL_FLIGHTS]
     data: dict[str, Any] = {
         "pictures": {picture.name: picture.svg for picture in pictures},
         "flights": [
@@ -315,7 +313,7 @@ def page_data(page: ReportInput, pictures: Iterable[FigureImage]) -> str:
         ],
         "palette": palette(),
     }
-    views = plotly_scene.scene_json(run, [flight.scene for flight in page.view], everyone, fov)
+    views = plotly_scene.scene_json([flight.scene for flight in page.view], fov)
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return f'{text[:-1]},"views":{views}}}'
 

@@ -18,7 +18,6 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report import plotly_scene
 from airl_mav.report.document import OUTCOME_LABELS
 from airl_mav.report.plotly_scene import (
     POINTS,
@@ -52,8 +51,8 @@ def trace(view: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def test_every_view_is_a_figure_that_plotly_accepts(demo: Demo) -> None:
-    views = json.loads(scene_json(demo[0], shown(demo), demo[0].episodes, 90.0))
-    assert len(views) == 3 + 1
+    views = json.loads(scene_json(shown(demo), 90.0))
+    assert len(views) == 3
     for view in views:
         # Raises on a property, or a value, that the library does not know.
         figure = go.Figure(view["figure"])
@@ -88,7 +87,7 @@ def test_the_path_is_that_of_the_flight(demo: Demo) -> None:
 def test_nothing_can_end_the_script_element(demo: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
     evil = "</script><!--<script>"
     monkeypatch.setitem(OUTCOME_LABELS, Outcome.SUCCESS, evil)
-    text = scene_json(demo[0], shown(demo), demo[0].episodes, 0.0)
+    text = scene_json(shown(demo), 0.0)
     assert "<" not in text
     assert evil in json.dumps(json.loads(text))
 
@@ -212,17 +211,6 @@ def test_the_slider_moves_obstacles_along_their_tours(demo: Demo) -> None:
             assert np.allclose(np.array(mesh["x"])[here] + shift[0], corners[:, 0], atol=0.05)
             assert np.allclose(np.array(mesh["y"])[here] + shift[1], corners[:, 1], atol=0.05)
         first += count
-
-
-def test_all_flights_together_are_coloured_by_how_they_ended(demo: Demo) -> None:
-    run, arenas = demo
-    view = plotly_scene.all_flights_view(run, run.episodes, arenas[0], shared=False)
-    names = [each["name"] for each in view["figure"]["data"]]
-    assert "obstacle" not in names
-    for outcome in {episode.outcome for episode in run.episodes}:
-        count = sum(episode.outcome is outcome for episode in run.episodes)
-        line = trace(view, f"{OUTCOME_LABELS[outcome]} ({count})")
-        assert line["x"].count(None) == count
 
 
 def test_a_path_is_cut_where_its_colour_changes() -> None:

@@ -35,7 +35,6 @@
   const seen = makeSeen(palette, goTo);
 
   function move(moment) {
-    if (!view.path) return null;
     now = moment;
     tell();
     return Promise.all([scene?.move(now), tracks.move(now - view.navigation)]);
@@ -51,15 +50,11 @@
     stop();
     const number = Number(pick.value);
     view = views[number];
-    const flight = flights[number] ?? null;
+    const flight = flights[number];
     seen.show(flight);
-    slider.disabled = play.disabled = !view.path;
-    clock.textContent = "";
-    if (view.path) {
-      [slider.min, slider.max] = [view.path.time[0], view.path.time[view.path.time.length - 1]];
-      now = Number(slider.max);
-      tell();
-    }
+    [slider.min, slider.max] = [view.path.time[0], view.path.time[view.path.time.length - 1]];
+    now = Number(slider.max);
+    tell();
     await tracks.show(flight, now - view.navigation);
     await scene?.show(number, now);
     box.dataset.shown = pick.value;

@@ -38,14 +38,12 @@ function makeScene(views) {
     }
     return [places, traces];
   }
-  const move = (now) => (view.path ? Plotly.restyle(plot, ...change(now)) : null);
+  const move = (now) => Plotly.restyle(plot, ...change(now));
   async function show(number, now) {
     view = views[number];
     const data = structuredClone(view.figure.data);
-    if (view.path) {
-      const [places, traces] = change(now);
-      traces.forEach((trace, k) => Object.assign(data[trace], { x: places.x[k], y: places.y[k], z: places.z[k] }));
-    }
+    const [places, traces] = change(now);
+    traces.forEach((trace, k) => Object.assign(data[trace], { x: places.x[k], y: places.y[k], z: places.z[k] }));
     const ink = getComputedStyle(document.body).color;
     const layout = { ...structuredClone(view.figure.layout), font: { color: ink } };
     for (const axis of ["xaxis", "yaxis", "zaxis"]) {

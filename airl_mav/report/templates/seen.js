@@ -46,8 +46,8 @@ function makeSeen(palette, goTo) {
   function show(chosen) {
     flight = chosen;
     shown = -1;
-    box.hidden = !flight || !flight.seen.length;
-    decisions = flight ? spans(flight) : [];
+    box.hidden = !flight.seen.length;
+    decisions = spans(flight);
   }
   function move(seconds) {
     if (box.hidden) return;

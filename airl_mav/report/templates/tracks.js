@@ -94,8 +94,7 @@ function makeTracks(goTo) {
     return list;
   }
   async function show(flight, seconds) {
-    box.hidden = !flight;
-    if (!flight) { drawn = false; return; }
+    box.hidden = false;
     const ink = getComputedStyle(document.body).color;
     const list = rows(flight);
     const high = 1 / list.length;
