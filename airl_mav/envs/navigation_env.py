@@ -228,12 +228,11 @@ class NavigationEnv(FleetDecisions, gym.Env[layouts.Encoded, Any]):
 
         Args:
             spec: The specification; or
-            render_mode: None, `rgb_array` or `human` (a window, which needs a display; without one
-                `metadata` does not list it).
+            render_mode: None or `rgb_array`.
             knobs: the fields of an EnvironmentSpec.
 
         Raises:
-            UsageError: A knob or a profile is invalid, or no display is available.
+            UsageError: A knob or a profile is invalid.
         """
         super().__init__(spec, knobs, 1)
         self.observation_space: gym.Space[Any] = observation_space(self.navigation.observation)
@@ -286,10 +285,6 @@ class NavigationEnv(FleetDecisions, gym.Env[layouts.Encoded, Any]):
     def render(self) -> NDArray[np.uint8] | None:
         """Return the present picture (540, 960, 3) in mode `rgb_array`, otherwise None."""
         return self._pictures.render()
-
-    def close(self) -> None:
-        """Close the window."""
-        self._pictures.close()
 
     def _observe(self) -> layouts.Encoded:
         seen = {key: value[0] for key, value in self.navigation.observe().items()}

@@ -6,8 +6,6 @@ Static parts are drawn once per episode; a frame adds the moving parts.
 from __future__ import annotations
 
 import math
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -35,8 +33,8 @@ TRAIL_COLOUR = "#c0392b"
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
 
 
-RENDER_MODES = ("rgb_array", "human")
-"""Render modes: pictures as arrays, or in a window."""
+RENDER_MODES = ("rgb_array",)
+"""Render modes; a window is Gymnasium's wrapper `HumanRendering`."""
 
 
 class PictureContent(NamedTuple):
@@ -59,7 +57,7 @@ class Pictures:
     """Pictures of an environment's episodes, according to its `render_mode`."""
 
     def __init__(self, spec: EnvironmentSpec, kind: CameraKind, mode: str | None) -> None:
-        """Open a window in mode human.
+        """Prepare pictures; nothing is drawn before it is asked for.
 
         Args:
             spec: The environment.
@@ -67,35 +65,29 @@ class Pictures:
             mode: None or a mode in `RENDER_MODES`.
 
         Raises:
-            UsageError: Unknown mode, or no display for a window.
+            UsageError: Unknown mode.
         """
         if mode is not None and mode not in RENDER_MODES:
             accepted = ", ".join(RENDER_MODES)
             raise UsageError(f"render_mode = {mode!r}: accepted: None, {accepted}")
         # One picture per decision: a video at this rate runs in real time.
-        fps = 1.0 / spec.episode.hold_s
-        # Gymnasium's checker opens every listed mode.
-        offered = [each for each in RENDER_MODES if each != "human" or display_found()]
-        self.metadata: dict[str, Any] = {"render_modes": offered, "render_fps": fps}
+        self.metadata = {"render_fps": 1.0 / spec.episode.hold_s}
         """Entries for the environment's `metadata`."""
         self.wanted = mode is not None
         """True if pictures will be requested."""
-        self._spec, self._kind, self._mode = spec, kind, mode
+        self._spec, self._kind = spec, kind
         self._renderer: EpisodeRenderer | None = None
         self._trail: list[NDArray[np.float64]] = []
         self._now: PictureContent | None = None
-        self._window = Window(fps) if mode == "human" else None
 
     def begin(self) -> None:
         """Start an episode."""
         self._trail.clear()
 
     def see(self, now: PictureContent) -> None:
-        """Store the state at a decision; a window shows it."""
+        """Store the state at a decision."""
         self._now = now
         self._trail.append(now.position[:2].copy())
-        if self._window is not None:
-            self._window.show(self._draw())
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the present picture (540, 960, 3) in mode `rgb_array`, otherwise None.
@@ -103,14 +95,8 @@ class Pictures:
         Raises:
             ResetNeeded: No episode has started.
         """
-        return self._draw() if self._mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Close the window."""
-        if self._window is not None:
-            self._window.close()
-
-    def _draw(self) -> NDArray[np.uint8]:
+        if not self.wanted:
+            return None
         if self._now is None:
             raise ResetNeeded("render() before reset()")
         if self._renderer is None:
@@ -208,55 +194,6 @@ class EpisodeRenderer:
             f"height {-position[2]:7.2f} m\n"
             f"energy {now.energy_j[0] / 1000.0:7.2f} kJ"
         )
-
-
-def display_found() -> bool:
-    """Return True if this machine has a display for windows."""
-    # Other systems have a display without these variables.
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-class Window:
-    """Window for pictures."""
-
-    def __init__(self, fps: float) -> None:
-        """Open the window; pictures stay for 1 / fps [s]. Raises UsageError without a display."""
-        from matplotlib import pyplot
-
-        self._pyplot = pyplot
-        self._seconds = 1.0 / fps
-        try:
-            self._figure = pyplot.figure(
-                figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI, num="airl/Navigation-v0"
-            )
-        except ImportError as error:  # the configured backend is unavailable
-            raise _no_display(str(error)) from None
-        # A backend such as Agg creates figures without a window.
-        if type(self._figure.canvas).required_interactive_framework is None:
-            pyplot.close(self._figure)
-            raise _no_display(f"matplotlib's backend is {pyplot.get_backend()}")
-        self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        self._axes.set_axis_off()
-        self._image: Any = None
-
-    def show(self, picture: NDArray[np.uint8]) -> None:
-        """Show a picture and process window events while it is shown."""
-        if self._image is None:
-            self._image = self._axes.imshow(picture)
-        self._image.set_data(picture)
-        self._pyplot.pause(self._seconds)
-
-    def close(self) -> None:
-        """Close the window."""
-        self._pyplot.close(self._figure)
-
-
-def _no_display(why: str) -> UsageError:
-    return UsageError(
-        f"render_mode = 'human': no display for a window ({why}); accepted here: 'rgb_array'"
-    )
 
 
 def _standing(arena: Arena) -> Arena:

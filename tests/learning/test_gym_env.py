@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-import types
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
-from matplotlib import pyplot
-from matplotlib.backend_bases import FigureManagerBase
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
-import airl_mav.envs.rendering
 from airl_mav.arena.generate import generate
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
@@ -48,33 +40,6 @@ FORWARD = 22
 """`arc-25`: full speed ahead."""
 
 
-class _Canvas(FigureCanvasAgg):  # type: ignore[misc]  # matplotlib is not followed
-    """A window without a display: events do nothing."""
-
-    manager_class = FigureManagerBase
-    # matplotlib's name for the only framework that "runs" without a display.
-    required_interactive_framework = "headless"
-    shown: list[np.ndarray] = []  # noqa: RUF012
-
-    def start_event_loop(self, timeout: float = 0) -> None:
-        self.draw()
-        self.shown.append(np.asarray(self.buffer_rgba())[..., :3].copy())
-
-
-@pytest.fixture
-def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
-    """Yield the images shown by a matplotlib backend that pretends to have a display."""
-    backend: Any = types.ModuleType("pretended_display")
-    backend.FigureCanvas = _Canvas
-    monkeypatch.setitem(sys.modules, backend.__name__, backend)
-    monkeypatch.setattr(airl_mav.envs.rendering, "display_found", lambda: True)
-    _Canvas.shown.clear()
-    with mpl.rc_context():
-        pyplot.switch_backend(f"module://{backend.__name__}")
-        yield _Canvas.shown
-        pyplot.switch_backend("agg")
-
-
 @pytest.mark.parametrize(
     "knobs",
     [
@@ -85,22 +50,11 @@ def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
     ],
     ids=["default", "continuous", "paper", "curriculum"],
 )
-def test_both_checkers_are_content(knobs: dict[str, Any], window: list[np.ndarray]) -> None:
+def test_both_checkers_are_content(knobs: dict[str, Any]) -> None:
     """Neither an error nor a warning: pytest turns those into errors. With all render modes."""
     env = gym.make(NAVIGATION, render_mode="rgb_array", **knobs).unwrapped
     check_env(env)
     check_env_for_sb3(env, skip_render_check=False)
-    assert window, "check_env looked at render_mode='human' too"
-
-
-def test_both_checkers_are_content_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    env = gym.make(DOOR, render_mode="rgb_array").unwrapped
-    check_env(env)
-    check_env_for_sb3(env, skip_render_check=False)
-    assert env.metadata["render_modes"] == ["rgb_array"], "there is nothing to open a window on"
-    assert NavigationEnv.metadata["render_modes"] == ["rgb_array", "human"]
 
 
 def test_gymnasium_records_a_video_of_an_episode(tmp_path: Path) -> None:
@@ -215,7 +169,7 @@ def test_make_vec_is_the_compiled_one() -> None:
         ({"curriculum": {"window": 0}}, r"curriculum\.window 0: accepted: 1 <= value"),
         ({"arena": "moon"}, "no arena profile 'moon'; shipped: "),
         ({"image_width_px": 30}, "camera 64x48 px; accepted: 30x24 px or a whole multiple"),
-        ({"render_mode": "ansi"}, "render_mode = 'ansi': accepted: None, rgb_array, human"),
+        ({"render_mode": "ansi"}, "render_mode = 'ansi': accepted: None, rgb_array"),
         ({"spec": EnvironmentSpec(), "arena": "x"}, "spec and arena: accepted: one or the other"),
     ],
 )
@@ -250,8 +204,6 @@ def test_gymnasium_s_wrappers_of_observations_take_the_vector_environment() -> N
 def test_wrong_arguments_of_the_vector_environment() -> None:
     with pytest.raises(UsageError, match="num_envs = 0: accepted: value >= 1"):
         NavigationVectorEnv(0)
-    with pytest.raises(UsageError, match="render_mode = 'human'"):
-        NavigationVectorEnv(1, render_mode="human")
     env = NavigationVectorEnv(2)
     with pytest.raises(UsageError, match="seed: 3 numbers; accepted: 2"):
         env.reset(seed=[1, 2, 3])
@@ -487,26 +439,3 @@ def test_pictures_are_of_now_and_of_this_episode() -> None:
     assert expected is not None
     assert np.array_equal(again, expected)
     assert NavigationEnv().render() is None
-
-
-def test_window_shows_every_decision(window: list[np.ndarray]) -> None:
-    env = NavigationEnv(render_mode="human")
-    picture = NavigationEnv(render_mode="rgb_array")
-    for each in (env, picture):
-        each.reset(seed=3)
-        each.step(FORWARD)
-    assert env.render() is None
-    assert len(window) == 2
-    assert window[-1].shape == (540, 960, 3)
-    expected = picture.render()
-    assert expected is not None
-    assert np.abs(window[-1].astype(int) - expected).mean() < 1.0
-    env.close()
-    assert not pyplot.get_fignums()
-
-
-def test_no_display_is_one_line() -> None:
-    pyplot.switch_backend("agg")
-    with pytest.raises(UsageError, match=r"'human': no display .* accepted here: 'rgb_array'"):
-        NavigationEnv(render_mode="human")
-    assert not pyplot.get_fignums()

@@ -143,7 +143,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
 
         Raises:
             UsageError: An option or a profile cannot be used, an option is supported only by the
-                vectorized simulator, or there is no display.
+                vectorized simulator.
         """
         # Settings of the flight beside those of the environment.
         beside = {name: knobs.pop(name) for name in BESIDE if name in knobs}
@@ -260,13 +260,12 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         return self._seen(), float(reward[0]), terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the current frame (540, 960, 3) for `rgb_array`; windows update automatically."""
+        """Return the current frame (540, 960, 3) for `rgb_array`."""
         return self._pictures.render()
 
     def close(self) -> None:
-        """End a running flight and close the window."""
+        """End a running flight."""
         self._end()
-        self._pictures.close()
 
     def _end(self) -> None:
         if self._ending is not None:
