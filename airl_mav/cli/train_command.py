@@ -87,6 +87,7 @@ def run(
                     out,
                     name=options.name or stem,
                     resume=options.resume,
+                    mixed_code=options.mixed_code,
                     progress=TrainingProgress(progress, config.steps),
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
                     view=None if viewer is None else viewer.ends,

@@ -7,18 +7,22 @@ need this module, and reading them does not need psutil.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from airl_mav import __version__
 from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
 
 NOT_OFFERED = "not offered by this system"
 VCGENCMD_TIMEOUT_S = 5.0
@@ -225,16 +229,116 @@ PACKAGES = (
 )
 GIT_TIMEOUT_S = 10.0
 
+SOURCES = "sources"
+"""Name of `sources_digest` among the versions."""
+
+NO_FLIGHT = ("airl-mav", "matplotlib", "pydantic", "pyzmq")
+"""Versions without effect on flights; the sources stand for airl-mav."""
+
+ROOT = Path(__file__).resolve().parents[2]
+"""Folder of the packages: the checkout, or site-packages."""
+
+
+@cache
+def sources_digest() -> str:
+    """Return the digest of all code and shipped profiles that decide flights, hexadecimal.
+
+    Equal for a checkout and its wheel. Without commands and reports, which only read flights.
+    """
+    profiles = ROOT / "airl_mav" / "_profiles"
+    # A checkout has the profiles beside the package.
+    roots = ["airl_mav", "companion", "firmware_sim", *([] if profiles.is_dir() else ["profiles"])]
+    digests = {
+        hashlib.sha256(file.read_bytes()).digest()
+        for root in roots
+        for file in (ROOT / root).rglob("*.*")
+        if file.suffix in (".py", ".toml")
+        and file.relative_to(ROOT).parts[:2] not in (("airl_mav", "cli"), ("airl_mav", "report"))
+    }
+    return hashlib.sha256(b"".join(sorted(digests))).hexdigest()[:12]
+
 
 def package_versions() -> dict[str, str]:
-    """Return the installed versions of all packages that can change a result."""
-    found = {"airl-mav": __version__}
+    """Return the versions of all packages that can change a result, and of the sources."""
+    found = {"airl-mav": __version__, SOURCES: sources_digest()}
     for name in PACKAGES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
     return found
+
+
+def code_of(made: Mapping[str, Any]) -> str:
+    """Return the identity of the code from `versions` and `git`: "FINGERPRINT@COMMIT".
+
+    The fingerprint is equal for code with the same flights. The part from @ is missing without git.
+    """
+    lines = sorted(f"{k} {v}\n" for k, v in made["versions"].items() if k not in NO_FLIGHT)
+    fingerprint = hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
+    git = made["git"]
+    return fingerprint if git is None else f"{fingerprint}@{git.get('commit')}"[:23]
+
+
+@cache
+def code_now() -> str:
+    """Return the identity of the code of this process."""
+    return code_of({"versions": package_versions(), "git": git_state()})
+
+
+def check_code(
+    where: object,
+    made: Mapping[str, Any],
+    flown: Iterable[str | None] = (),
+    *,
+    mixed: bool,
+    say: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Compare the code of a folder's results with this code.
+
+    Args:
+        where: Name of the folder in messages.
+        made: Provenance of the folder: `versions` and `git`.
+        flown: Code of each result.
+        mixed: True accepts results of several versions.
+        say: Called with a line about an accepted difference.
+
+    Raises:
+        UsageError: Results of other code, unless `mixed`.
+    """
+    held = dict.fromkeys((code_of(made), *(each or "unknown code" for each in flown)))
+    others = [code for code in held if code != code_now()]
+    if not others:
+        return
+    line = f"{where}: flown with code {' and '.join(others)}; this is {code_now()}"
+    if {code.partition("@")[0] for code in others} == {code_now().partition("@")[0]}:
+        say(f"{line}: another commit, the same code of flights")
+        return
+    old, now = made["versions"], package_versions()
+    changes = [
+        f"{k} {old.get(k)}, not {now.get(k)}" for k in {**old, **now} if old.get(k) != now.get(k)
+    ]
+    line += f" ({'; '.join(changes)})" if changes else ""
+    if not mixed:
+        raise UsageError(f"{line}; accepted: a new folder, the same code, or --mixed-code")
+    say(f"{line}: goes on with several versions of the code")
+
+
+def flown_with(codes: Iterable[str | None]) -> str:
+    """Return the code of flights as text; "" if it is unknown for all."""
+    counts = Counter(code or "unknown" for code in codes)
+    if len(counts) < 2:
+        return "".join(set(counts) - {"unknown"})
+    return ", ".join(f"{code} ({n:,} flights)" for code, n in counts.items())
+
+
+def mixed_code(codes: Iterable[str | None]) -> tuple[str, ...]:
+    """Return a sentence if flights have different code; else nothing."""
+    codes = list(codes)
+    versions = len({(code or "unknown").partition("@")[0] for code in codes})
+    if versions < 2:
+        return ()
+    return (f"Flown with {versions} versions of the code: {flown_with(codes)}.",)
 
 
 def provenance(command: str) -> dict[str, Any]:

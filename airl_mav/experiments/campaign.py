@@ -322,7 +322,7 @@ class _OpenCell:
             say = partial(progress.note, style="yellow")
             # Lock before reading: another process may be saving its last episode.
             stack.enter_context(nullcontext() if out is None else locked(out, say))
-            self.folder, self.done = run_folder.open_folder(out, cell.name, cell.scenario)
+            self.folder, self.done = run_folder.open_folder(out, cell.name, cell.scenario, say)
             planned = len(cell.scenario.seeds)
             if self.done:
                 progress.note(
@@ -504,13 +504,14 @@ def open_campaign(
     command: str,
     free: Collection[str] = (),
     growing: Collection[str] = (),
+    mixed: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Campaign]:
     """Open and lock a campaign's folder, new or to resume; cells may be added or left for later.
 
     Settings in `free`, or in tables named there, may differ on resumption. Numeric cell settings in
-    `growing` may grow. `say` is called when another process has locked the folder. Raises
-    UsageError for other content or changed settings.
+    `growing` may grow. `mixed` accepts results of other code. `say` is called when another process
+    has locked the folder. Raises UsageError for other content, changed settings or other code.
     """
     path = path.absolute()
     with locked(path, say):
@@ -521,6 +522,8 @@ def open_campaign(
                 f"--out {path}: holds a campaign with {difference}; accepted: another folder, or "
                 "the same settings to go on"
             )
+        if held:
+            machine.check_code(f"--out {path}", held.made, mixed=mixed, say=say)
         campaign = Campaign(declaration, held.made if held else machine.provenance(command))
         # An unchanged file keeps its date.
         if campaign != held:

@@ -10,10 +10,11 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
+import platform
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -28,7 +29,7 @@ from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import quantity
-from airl_mav.core.machine import usable_cores
+from airl_mav.core.machine import package_versions, usable_cores
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario import aircraft, model, resolve
 
@@ -148,6 +149,23 @@ class Failure:
     def error(self, job: str) -> UsageError | WorkerError:
         """Return the exception for a job of a given name."""
         return (UsageError if self.usage else WorkerError)(f"{job}: {self.message}")
+
+
+def check_versions(driver: Mapping[str, str]) -> None:
+    """Raise UsageError if this worker's versions differ from those of the process that started it.
+
+    `driver` are that process's `package_versions`: a worker imports what its machine has now.
+    """
+    here = package_versions()
+    if different := [
+        f"{name} {here.get(name)}, not {driver.get(name)}"
+        for name in {**driver, **here}
+        if here.get(name) != driver.get(name)
+    ]:
+        raise UsageError(
+            f"the worker on {platform.node()} has other code: {'; '.join(different)}; accepted: the"
+            " same versions on every machine, unchanged during the run"
+        )
 
 
 def answer(work: Callable[[], Iterable[R]]) -> list[R] | Failure:
@@ -289,7 +307,7 @@ class _Pool(Generic[J]):
         """Assign a worker to this run and send its first job."""
         worker = self._take_idle() or _spawn()
         self.busy[worker.connection] = _Worker(worker.process, job, attempt)
-        _send(worker.connection, (self._start, job))
+        _send(worker.connection, ((self._start, package_versions()), job))
 
     def _take_idle(self) -> _Idle | None:
         """Return an idle worker and remove lost ones; None if there is no idle worker."""
@@ -417,14 +435,15 @@ class _Compiling:
 def _serve(connection: Connection) -> None:
     """Run jobs until the pipe is closed; the first job of a run includes its initializer."""
     _end_with_parent()
-    start: Start[Any, Any] | None = None
+    begin: tuple[Start[Any, Any], Mapping[str, str]] | None = None
     work: Work[Any, Any] | None = None
 
     def carry_out(job: Any) -> Iterable[Any]:
-        nonlocal start, work
-        if start is not None:
+        nonlocal begin, work
+        if begin is not None:
             work = None  # Release the previous run's data first.
-            work, start = start(never), None
+            check_versions(begin[1])
+            work, begin = begin[0](never), None
         assert work is not None  # noqa: S101 (no run begins without a start)
         return work(job)
 
@@ -437,7 +456,7 @@ def _serve(connection: Connection) -> None:
             new, job = connection.recv()
         except EOFError:
             return
-        start = new or start
+        begin = new or begin
         with heard_compiling(tell):
             told = answer(partial(carry_out, job))
         try:

@@ -177,6 +177,7 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
         command=" ".join(sys.argv),
         free=free_fields("gym"),
         growing=("episodes",),
+        mixed=any(cell.scenario.scenario.mixed_code for cell in experiment.cells),
         say=lambda text: progress.note(text, "yellow"),
     ):
         for level, group in groupby(

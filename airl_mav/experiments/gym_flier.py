@@ -10,6 +10,7 @@ from typing import Any
 from airl_mav import faults, prediction
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.machine import code_now
 from airl_mav.envs.arena_batch import CEILING, FLOOR, WALL
 from airl_mav.envs.evaluation import (
     OUTCOMES,
@@ -194,6 +195,7 @@ class GymFlier:
             faults=tuple(
                 FaultActed(*each) for each in acted(self.scenario.scenario.faults, ended_us)
             ),
+            code=code_now(),
         )
         return FlownEpisode(record, trajectory, latency)
 

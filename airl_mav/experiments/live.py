@@ -65,7 +65,8 @@ def fly_live(
         if out is not None:
             # Lock first: processes of a killed run may still be writing.
             keeps = held.enter_context(locked(out, say))
-        folder, done = open_folder(out, name or f"{asked.level}-{scenario.policy.name}", scenario)
+        name = name or f"{asked.level}-{scenario.policy.name}"
+        folder, done = open_folder(out, name, scenario, say)
         if out is None:
             keeps = held.enter_context(locked(folder.path, say))
         if done:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.machine import code_now
 from airl_mav.faults import LINKS, PROCESSES, Fault
 from airl_mav.flight import judge
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
@@ -297,6 +298,7 @@ def judged_record(
         ended_us=verdict.time_us,
         tours_s=scenario.takeoff_s,
         quality=quality,
+        code=code_now(),
         **known,
     )
 

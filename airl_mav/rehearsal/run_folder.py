@@ -23,7 +23,7 @@ from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError, usage_errors
 from airl_mav.core.files import PARTIAL_SUFFIX
-from airl_mav.core.machine import describe_machine, git_state, package_versions
+from airl_mav.core.machine import check_code, describe_machine, git_state, package_versions
 from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
 from airl_mav.flight.episode_record import NO_ARENA, EpisodeRecord, Setup
 from airl_mav.flight.episode_record import SCHEMA as LINE_SCHEMA
@@ -216,13 +216,17 @@ def check_folder(path: Path, wanted: str) -> None:
 
 
 def open_folder(
-    out: Path | None, name: str, scenario: ResolvedScenario
+    out: Path | None,
+    name: str,
+    scenario: ResolvedScenario,
+    say: Callable[[str], None] = lambda _: None,
 ) -> tuple[RunFolder, tuple[EpisodeRecord, ...]]:
     """Open the folder of a new run, or of the same run, finished or not.
 
     A run whose seeds are the first of the requested seeds is the same run, and is extended. Removes
     invalid episodes, which the host disturbed, for a new flight. Returns the folder and its
-    episodes. Raises UsageError if the folder contains something else, or another run.
+    episodes. `say` gets a line about other code. Raises UsageError if the folder contains something
+    else, another run, or flights of other code without `mixed_code`.
     """
     config, seeds = scenario.config, scenario.seeds
     if out is not None:
@@ -240,6 +244,8 @@ def open_folder(
             "settings to go on"
         )
     folder, run = RunFolder.resume(out)
+    flown = [episode.code for episode in run.episodes]
+    check_code(f"--out {out}", vars(held), flown, mixed=scenario.scenario.mixed_code, say=say)
     folder.sweep()
     if grows:
         folder.plan_again(config, seeds)

@@ -296,6 +296,9 @@ class Workers(ProfileModel):
         description="with executor ray: local starts a Ray on this machine, auto takes the one that"
         " runs here, else HOST:PORT of the head of a cluster whose machines all see the folder",
     )
+    mixed_code: Annotated[bool, FREE] = switch(
+        "continue a folder whose flights have another version of the code; reports list all"
+    )
 
 
 class Flights(Workers):

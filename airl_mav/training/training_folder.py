@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -64,9 +65,19 @@ class TrainingFolder:
 
     @classmethod
     def begin(
-        cls, path: Path, config: TrainingConfig, command: str, *, resume: bool
+        cls,
+        path: Path,
+        config: TrainingConfig,
+        command: str,
+        *,
+        resume: bool,
+        mixed: bool = False,
+        say: Callable[[str], None] = lambda _: None,
     ) -> TrainingFolder:
-        """Start a run in a folder or open its run; UsageError if it cannot be resumed."""
+        """Start a run in a folder or open its run; UsageError if it cannot be resumed.
+
+        `mixed` resumes a run of other code, and adds this code to `resumed_with` in `train.json`.
+        """
         folder = cls(path)
         if not folder.begun:
             plain = config.model_dump(mode="json", exclude_none=True)
@@ -87,6 +98,12 @@ class TrainingFolder:
                 f"{path}: the run to resume has another configuration "
                 f"({', '.join(changed)}); accepted: the same"
             )
+        about = folder.about()
+        since = about.get("resumed_with", [])
+        machine.check_code(path, about, since, mixed=mixed, say=say)
+        if machine.code_now() not in (machine.code_of(about), *since):
+            about["resumed_with"] = [*since, machine.code_now()]
+            files.write_json(path / CONFIG_FILE, about)
         return folder
 
     @property
@@ -171,6 +188,9 @@ class TrainRequest(BaseModel):
     resume: bool = switch(
         "continue the run in --out from its newest checkpoint; start it if there is none"
     )
+    mixed_code: bool = switch(
+        "continue a run that another version of the code began; train.json lists the versions"
+    )
 
     @property
     def stem(self) -> str:
@@ -190,7 +210,7 @@ class TrainRequest(BaseModel):
         except errors.FieldError as error:  # The error is in the file, not in an option.
             raise errors.UsageError(f"{self.config}: {error.line(sign=' = ')}") from None
         # Without options that are not part of the configuration.
-        asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume"}
+        asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume", "mixed_code"}
         changes = self.model_dump(include=asked)
         return configured(loaded, **changes)
 

@@ -95,6 +95,7 @@ def train(
     *,
     name: str,
     resume: bool = False,
+    mixed_code: bool = False,
     progress: training_folder.TrainingProgress | None = None,
     device: str = "cpu",
     command: str = "airl_mav.training.training_run.train",
@@ -102,7 +103,8 @@ def train(
 ) -> TrainingResult:
     """Train a policy to the end and export its best weights.
 
-    `resume` continues the run in `out` from its newest checkpoint, if any. The live view does not
+    `resume` continues the run in `out` from its newest checkpoint, if any; `mixed_code` also if
+    another version of the code began it. The live view does not
     change the weights. Returns the run's folder, the best evaluation and the policy's card.
 
     Raises:
@@ -116,7 +118,9 @@ def train(
     with locked(out, progress.waiting):
         if not training_folder.TrainingFolder(out).begun:
             check_trainable(config, name, device)  # before there is a run in the folder
-        folder = training_folder.TrainingFolder.begin(out, config, command, resume=resume)
+        folder = training_folder.TrainingFolder.begin(
+            out, config, command, resume=resume, mixed=mixed_code, say=progress.waiting
+        )
         if view is None:
             best = fit(config, folder, progress, device)
         else:

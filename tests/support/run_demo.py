@@ -8,6 +8,7 @@ import numpy as np
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
+from airl_mav.core.machine import code_now
 from airl_mav.core.resource_use import ProcessUse
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
@@ -123,6 +124,7 @@ def demo_episode(
         ),
         notes=("watchdog: a decision was 620 ms late",) if index == 2 else (),
         companion_use=demo_use(index),
+        code=code_now(),
     )
     accepted = np.array(setpoints, np.int64).reshape(-1, 2)
     if index == 1:

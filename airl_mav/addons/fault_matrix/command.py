@@ -55,6 +55,10 @@ class FaultsOptions(fields.ProfileModel):
         le=model.GREATEST_WORKERS,
         default=None,
     )
+    mixed_code: bool = fields.switch(
+        "continue a matrix whose flights have another version of the code; faults.md lists the"
+        " versions"
+    )
     out: Path | None = Field(
         default=None,
         description="folder of faults.json, every flight, and faults.md, the table; by default"
@@ -77,7 +81,11 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     out.mkdir(parents=True, exist_ok=True)
     file = out / "faults.json"
     matrix = fault_matrix.resumed(
-        file, machine.provenance("airl faults"), fault_matrix.vehicle_digest(vehicle)
+        file,
+        machine.provenance("airl faults"),
+        fault_matrix.vehicle_digest(vehicle),
+        mixed=options.mixed_code,
+        say=console.print,
     )
     done: list[fault_matrix.MatrixCell] = []
     with RichProgress(console) as progress:
@@ -92,8 +100,12 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
             vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
         )
         bar.close()
-    files.replace_file(out / "faults.md", fault_matrix.markdown(cells).encode())
+    mixed = "".join(machine.mixed_code(each.code for cell in cells for each in cell.flights))
+    text = fault_matrix.markdown(cells) + (f"\n{mixed}\n" if mixed else "")
+    files.replace_file(out / "faults.md", text.encode())
     print_table(table_of(faults, phases, cells), console, wrap=True)
+    if mixed:
+        console.print(mixed, soft_wrap=True)
     console.print(f"{out}", soft_wrap=True)
     return errors.EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
 

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from airl_mav.core import clock, constants, errors, files, frames
+from airl_mav.core.machine import check_code, code_now
 from airl_mav.faults import Fault, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
@@ -141,6 +142,8 @@ class FaultFlight:
     mode: str
     said: tuple[str, ...]
     """Texts for the operator after the start of the fault."""
+    code: str | None = None
+    """Identity of the code that flew it (`core.machine.code_of`)."""
 
 
 def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> FaultFlight:
@@ -204,7 +207,7 @@ class _Flight:
         touchdown_m_s, farthest_m = max(self.touchdowns, default=None), round(self.farthest_m, 3)
         mode, texts = self.autopilot.flight.mode.name, tuple(dict.fromkeys(self.texts))
         result = end or "flying", touchdown_m_s, farthest_m, mode, texts
-        return FaultFlight(self.fault, self.phase, self.seed, *result)
+        return FaultFlight(self.fault, self.phase, self.seed, *result, code=code_now())
 
     def _tick(self) -> End | None:
         """Fly a tick; return the end if the flight is over, otherwise None."""
@@ -459,18 +462,23 @@ def load(path: Path) -> Matrix:
     return Matrix(made, vehicle, tuple(MatrixCell(*key, tuple(of)) for key, of in cells.items()))
 
 
-def resumed(path: Path, made: Mapping[str, Any], vehicle: str) -> Matrix:
-    """Return a stopped run's matrix, or an empty one; UsageError for another vehicle's matrix."""
+def resumed(
+    path: Path,
+    made: Mapping[str, Any],
+    vehicle: str,
+    *,
+    mixed: bool,
+    say: Callable[[str], None] = lambda _: None,
+) -> Matrix:
+    """Return a stopped run's matrix, or an empty one.
+
+    Raises UsageError for another vehicle's matrix, or one of other code unless `mixed`.
+    """
     if not path.exists():
         return Matrix(dict(made), vehicle, ())
     found = load(path)
     if found.vehicle != vehicle:
         raise errors.UsageError(f"{path}: flown by another vehicle; accepted: another --out")
-    if _version(found.made) != _version(made):
-        raise errors.UsageError(f"{path}: flown by another version; accepted: another --out")
+    flown = [flight.code for cell in found.cells for flight in cell.flights]
+    check_code(path, found.made, flown, mixed=mixed, say=say)
     return found
-
-
-def _version(made: Mapping[str, Any]) -> tuple[object, object]:
-    git = made["git"]
-    return made["versions"]["airl-mav"], None if git is None else git["commit"]

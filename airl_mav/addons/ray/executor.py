@@ -6,8 +6,9 @@ import hashlib
 import logging
 import os
 import pickle
+import secrets
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -16,6 +17,7 @@ from typing import Any, ClassVar
 
 from airl_mav.core.compiling import Heard
 from airl_mav.core.errors import FieldError
+from airl_mav.core.machine import package_versions
 from airl_mav.experiments import executors
 from airl_mav.scenario.model import Workers
 
@@ -55,12 +57,13 @@ class RayExecutor:
         import ray
 
         task = ray.remote(num_cpus=1, num_gpus=self.gpus, max_retries=0)(_carry_out)
+        versions = package_versions()
         pickled = pickle.dumps(start)
         key, shared = hashlib.sha256(pickled).hexdigest(), ray.put(pickled)
         waiting, busy = iter(jobs), dict[Any, tuple[executors.J, int]]()
 
         def begin(job: executors.J, attempt: int = 1) -> None:
-            busy[task.remote(key, shared, job)] = job, attempt
+            busy[task.remote(key, versions, shared, job)] = job, attempt
 
         def fill() -> None:
             while len(busy) < self.workers:
@@ -100,11 +103,12 @@ _started: dict[str, executors.Work[Any, Any]] = {}
 """Initialized work of one run in this Ray worker, by its key."""
 
 
-def _carry_out(key: str, pickled: bytes, job: Any) -> Any:
-    """Run a job in a Ray worker."""
+def _carry_out(key: str, versions: Mapping[str, str], pickled: bytes, job: Any) -> Any:
+    """Run a job in a Ray worker with the driver's versions."""
 
     def work() -> Iterable[Any]:
         if key not in _started:
+            executors.check_versions(versions)
             _started.clear()
             # Set before numba and similar libraries are imported.
             os.environ.update(executors.ONE_THREAD)
@@ -128,6 +132,24 @@ def _check_reachable(address: str) -> None:
         raise FieldError("ray_address", address, problem=problem) from None
 
 
+def _require_token(address: str) -> None:
+    """Turn Ray's token authentication on; raise UsageError if a cluster's token is missing.
+
+    A local instance gets a new token that only this process and its workers have.
+    """
+    mode = os.environ.setdefault("RAY_AUTH_MODE", "token")
+    if mode != "token":
+        raise FieldError(
+            "RAY_AUTH_MODE", mode, "token: Ray runs the code of everyone who reaches it"
+        )
+    file = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
+    if address == LOCAL:
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    elif not os.environ.get("RAY_AUTH_TOKEN") and not (file.is_file() and file.read_text().strip()):
+        problem = f"no token in RAY_AUTH_TOKEN or {file}; accepted: the token of the cluster"
+        raise FieldError("ray_address", address, problem=problem)
+
+
 @contextmanager
 def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecutor]:
     """Connect to Ray, or raise UsageError; `gpus` is the share of a GPU per job."""
@@ -136,10 +158,13 @@ def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecuto
     address, local = settings.ray_address, settings.ray_address == LOCAL
     if address not in (LOCAL, AUTO):
         _check_reachable(address)
+    _require_token(address)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # Tasks without a GPU hide all GPUs in any case.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")
     if local:
+        # Ray then takes 127.0.0.1 for its node's address, and binds all sockets to it.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
         # Lets Ray's workers import this package, installed or not.
         here = f"{Path(__file__).resolve().parents[3]}"
         known = os.environ.get("PYTHONPATH")
@@ -150,12 +175,12 @@ def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecuto
     if local:
         started = {"num_cpus": settings.workers or cores, "include_dashboard": False}
     try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **started)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise FieldError("ray_address", address, problem=first) from None
-    try:
-        nodes = [node for node in ray.nodes() if node["Alive"]]
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **started)
+            nodes = [node for node in ray.nodes() if node["Alive"]]
+        except Exception as error:  # Ray raises plain exceptions for time-outs and lost processes.
+            first = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise FieldError("ray_address", address, problem=first) from None
         there = sum(int(node["Resources"].get("CPU", 0)) for node in nodes)
         yield RayExecutor(settings.workers or max(there, 1), gpus)
     finally:

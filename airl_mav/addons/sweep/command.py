@@ -155,13 +155,14 @@ def _worker(
     folder: SweepFolder,
     command: str,
     device: str,
+    mixed: bool,
     stop: executors.Stop,  # noqa: ARG001 (a worker is killed, and loses no checkpoint)
 ) -> Callable[[Trial], list[TrialResult]]:
     """Return the function that runs a trial."""
     # Imported late: the learner takes two seconds to load, and only a worker needs it.
     from airl_mav.addons.sweep.trial_run import run_trial
 
-    return lambda trial: [run_trial(folder, trial, command, device)]
+    return lambda trial: [run_trial(folder, trial, command, device, mixed)]
 
 
 def run_sweep(
@@ -173,6 +174,7 @@ def run_sweep(
     progress: Progress,
     device: str = "cpu",
     computer: Computer | None = None,
+    mixed_code: bool = False,
     stop: executors.Stop = executors.never,
 ) -> tuple[Sweep, str | None]:
     """Run the remaining trials; `sweep.json` is written after each.
@@ -183,7 +185,9 @@ def run_sweep(
     something else.
     """
     say = partial(progress.note, style="yellow")
-    with open_campaign(path, declaration(config), command=command, say=say) as campaign:
+    with open_campaign(
+        path, declaration(config), command=command, mixed=mixed_code, say=say
+    ) as campaign:
         folder = SweepFolder(path.absolute(), config)
 
         def summary() -> Sweep:
@@ -201,7 +205,7 @@ def run_sweep(
 
         results = executor.run(
             waiting,
-            partial(_worker, folder, command, device),
+            partial(_worker, folder, command, device, mixed_code),
             name=lambda trial: trial.name,
             stop=stopped,
             lost=say,
@@ -291,6 +295,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
                 progress=progress,
                 device=options.device,
                 computer=computer,
+                mixed_code=options.mixed_code,
                 stop=stop,
             )
         if error is not None:

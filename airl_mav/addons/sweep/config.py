@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from airl_mav.core import errors, fields
+from airl_mav.core import errors, fields, machine
 from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy import card, card_writing
@@ -214,6 +214,8 @@ class TrialResult:
     """Mean flight time; None: no flight reached the goal."""
     distance_m: float | None
     energy_j: float | None
+    code: str | None = None
+    """Identity of the code that ended the trial (`core.machine.code_of`)."""
 
     @property
     def success_rate(self) -> float:
@@ -241,4 +243,5 @@ def result_of(
         flight_time_s=mean_of_successes(flights, "flight_time_s"),
         distance_m=mean_of_successes(flights, "distance_m"),
         energy_j=mean_of_successes(flights, "energy_j"),
+        code=machine.code_now(),
     )

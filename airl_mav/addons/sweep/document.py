@@ -12,6 +12,7 @@ from rich.console import Console
 
 from airl_mav.addons.sweep import summary
 from airl_mav.addons.sweep.config import SweepConfig, training_of, trials
+from airl_mav.core.machine import mixed_code
 from airl_mav.report import document, heatmap
 from airl_mav.report.theme import FigureImage
 
@@ -255,6 +256,7 @@ def sweep_facts(sweep: summary.Sweep) -> document.Facts:
             f"{environment.image_width_px}x{environment.image_height_px} px, "
             f"layout {environment.layout}, actions {environment.actions}",
         ),
+        *(("code", line) for line in mixed_code(r.code for c in sweep.cells for r in c.results)),
         (
             "judged by",
             f"{judged.episodes:,} flights each, seeds {judged.seed} to {last}, level gym",

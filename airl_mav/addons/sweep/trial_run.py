@@ -22,12 +22,14 @@ from airl_mav.training.training_folder import TrainingFolder, TrainingProgress
 from airl_mav.training.training_run import export_best, fit, nominal
 
 
-def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
+def run_trial(
+    folder: SweepFolder, trial: Trial, command: str, device: str, mixed: bool
+) -> TrialResult:
     """Run or resume a trial on cpu or cuda; return its result. Raises UsageError."""
     config, path = training_of(folder.config, trial), folder.trial_path(trial)
     # Waits for an ending worker to release the trial.
     with locked(path, lambda _: None):
-        training = TrainingFolder.begin(path, config, command, resume=True)
+        training = TrainingFolder.begin(path, config, command, resume=True, mixed=mixed)
         # Checked under the lock: its previous owner may have ended the trial.
         if (done := folder.result(trial)) is not None:
             return done

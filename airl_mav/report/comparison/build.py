@@ -167,18 +167,10 @@ def _facts(run: LoadedRun) -> dict[str, str]:
         facts["arena and goal of seed"] = f"{seed}"
     if (hold := _hold(run.info.config)) is not None:
         facts["hold t3"] = f"{hold:g} s"
-    facts["commit"] = _commit(run.info.git)
     facts["flown on"] = ", ".join(
         f"{run.info.machine[key]}" for key in MACHINE_TERMS if run.info.machine.get(key)
     )
     return {term: text for term, text in facts.items() if text and term not in UNCOMPARED}
-
-
-def _commit(git: Mapping[str, Any] | None) -> str:
-    if git is None or not git.get("commit"):
-        return ""
-    changed = " (with changes)" if git.get("changed") else ""
-    return f"{str(git['commit'])[:10]}{changed}"
 
 
 def _hold(config: Mapping[str, Any]) -> float | None:

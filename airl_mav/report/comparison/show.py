@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from airl_mav.core.errors import UsageError, usage_errors
+from airl_mav.core.machine import mixed_code
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.requirements import Requirement, find, settle
@@ -118,6 +119,7 @@ def judge_comparison(
     lines = tuple(f"{name}, {line}" for name, flights in invalid.items() for line in flights)
     sentences = comparison.answers or verdict.sentences
     sentences += run_verdict.unchecked([run.info for run in loaded.values()])
+    sentences += mixed_code(each.code for run in loaded.values() for each in run.episodes)
     return replace(verdict, sentences=sentences, invalid=lines)
 
 
