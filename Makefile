@@ -5,6 +5,8 @@ BIN   := $(VENV)/bin
 # What flies, and what trains and tests: torch is large, and no flight needs it.
 FLY   := $(VENV)/.installed-sim
 ALL   := $(VENV)/.installed-all
+# All, and Ray, whose tests run every night.
+RAY   := $(VENV)/.installed-ray
 
 # One more than there are cores: tests that fly mostly wait.
 WORKERS := $(shell expr $$(nproc) + 1)
@@ -45,6 +47,9 @@ $(ALL): pyproject.toml constraints.txt scripts/find-python
 	$(call install,sim$(comma)train$(comma)dev)
 	@touch $(FLY)
 
+$(RAY): $(ALL)
+	$(call install,sim$(comma)train$(comma)dev$(comma)ray)
+
 .PHONY: install
 install: $(ALL)  ## Create .venv and install everything needed to fly, train and test
 
@@ -84,7 +89,7 @@ test: $(FLY)  ## Everything CI checks
 	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD) -m "not nightly" --durations 25
 
 .PHONY: nightly
-nightly: $(ALL)  ## All tests, with the long ones of stops and kills
+nightly: $(RAY)  ## All tests, with the long ones of stops and kills, and those of Ray
 	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD)
 
 .PHONY: docs

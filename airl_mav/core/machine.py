@@ -241,21 +241,17 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @cache
 def sources_digest() -> str:
-    """Return the digest of all code and shipped profiles that decide flights, hexadecimal.
+    """Return the digest of all code that decides flights, hexadecimal.
 
-    Equal for a checkout and its wheel. Without commands and reports, which only read flights.
+    Commands and reports only read flights. Runs contain the digests of their profiles.
     """
-    profiles = ROOT / "airl_mav" / "_profiles"
-    # A checkout has the profiles beside the package.
-    roots = ["airl_mav", "companion", "firmware_sim", *([] if profiles.is_dir() else ["profiles"])]
-    digests = {
+    digests = sorted(
         hashlib.sha256(file.read_bytes()).digest()
-        for root in roots
-        for file in (ROOT / root).rglob("*.*")
-        if file.suffix in (".py", ".toml")
-        and file.relative_to(ROOT).parts[:2] not in (("airl_mav", "cli"), ("airl_mav", "report"))
-    }
-    return hashlib.sha256(b"".join(sorted(digests))).hexdigest()[:12]
+        for package in ("airl_mav", "companion", "firmware_sim")
+        for file in (ROOT / package).rglob("*.py")
+        if file.relative_to(ROOT).parts[:2] not in (("airl_mav", "cli"), ("airl_mav", "report"))
+    )
+    return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
 
 
 def package_versions() -> dict[str, str]:

@@ -44,7 +44,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name in ("airl_mav/core/a.py", "airl_mav/report/page.py", "profiles/vehicles/quad.toml"):
+    for name in ("airl_mav/core/a.py", "airl_mav/report/page.py", "companion/b.py"):
         file = tmp_path / name
         file.parent.mkdir(parents=True)
         file.write_text(name)
@@ -56,7 +56,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("name", "decides"),
     [
         ("airl_mav/core/a.py", True),
-        ("profiles/vehicles/quad.toml", True),
+        ("companion/b.py", True),
         ("airl_mav/report/page.py", False),
     ],
 )
@@ -64,12 +64,6 @@ def test_the_digest_covers_what_decides_flights(checkout: Path, name: str, decid
     before = machine.sources_digest.__wrapped__()
     (checkout / name).write_text("changed")
     assert (machine.sources_digest.__wrapped__() != before) is decides
-
-
-def test_a_wheel_has_the_digest_of_its_checkout(checkout: Path) -> None:
-    before = machine.sources_digest.__wrapped__()
-    (checkout / "profiles").rename(checkout / "airl_mav" / "_profiles")
-    assert machine.sources_digest.__wrapped__() == before
 
 
 def test_the_fingerprint_depends_on_packages_that_fly() -> None:

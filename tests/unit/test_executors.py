@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
@@ -12,9 +14,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.machine import package_versions
 from airl_mav.experiments import executors
 from airl_mav.experiments.executors import (
     ONE_THREAD,
@@ -310,6 +314,93 @@ def test_the_job_of_a_lost_worker_of_ray_begins_again_twice(
         else:
             with pytest.raises(WorkerError, match=r"^seed 3: lost 3 workers, the last one by"):
                 list(results)
+
+
+@NEEDS_RAY
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_a_local_ray_listens_on_loopback_only(ray_executor: Executor) -> None:
+    list(ray_executor.run(range(2), worker_jobs.pairs))
+    here = psutil.Process()
+    listening = {
+        socket.laddr.ip
+        for process in (here, *here.children(recursive=True))
+        for socket in process.net_connections("inet")
+        if socket.status == psutil.CONN_LISTEN
+    }
+    assert listening
+    assert listening <= {"127.0.0.1", "::ffff:127.0.0.1", "::1"}
+
+
+@NEEDS_RAY
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_a_local_ray_rejects_clients_without_its_token(
+    ray_executor: Executor, tmp_path: Path
+) -> None:
+    import ray
+
+    list(ray_executor.run(range(2), worker_jobs.pairs))
+    address = ray.get_runtime_context().gcs_address
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")}
+    told = subprocess.run(
+        [sys.executable, "-c", f"import ray; ray.init({address!r}); print('connected')"],
+        env=environment | {"HOME": f"{tmp_path}"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert told.returncode != 0
+    assert "connected" not in told.stdout
+    assert "oken is missing" in told.stderr
+
+
+@NEEDS_RAY
+@pytest.mark.slow
+@pytest.mark.xdist_group("ray")
+def test_a_worker_of_ray_with_other_code_is_refused(
+    ray_executor: Executor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = {**package_versions(), "numpy": "0.1"}
+    monkeypatch.setattr("airl_mav.addons.ray.executor.package_versions", lambda: other)
+    with pytest.raises(UsageError, match=r"has other code: numpy \S+, not 0.1; accepted: the same"):
+        list(ray_executor.run([1], partial(worker_jobs.counted, tmp_path)))
+
+
+@NEEDS_RAY
+@pytest.mark.slow
+def test_a_ray_that_cannot_start_is_told_in_one_line(tmp_path: Path) -> None:
+    words = ("evaluate", "greedy", "--level", "lockstep", "--episodes", "1", "--executor", "ray")
+    told = subprocess.run(
+        [sys.executable, "-m", "airl_mav.cli.main", *words, "--out", f"{tmp_path / 'run'}"],
+        env=os.environ | {"RAY_TMPDIR": "/proc/none"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert told.returncode == 2
+    assert "--ray-address local: " in told.stderr + told.stdout
+    assert "Traceback" not in told.stderr + told.stdout
+
+
+@NEEDS_RAY
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"RAY_AUTH_MODE": "disabled"}, "RAY_AUTH_MODE 'disabled': accepted: token"),
+        ({"RAY_AUTH_TOKEN": ""}, "ray_address 'auto': no token in RAY_AUTH_TOKEN or "),
+    ],
+)
+def test_a_cluster_needs_a_token(
+    variables: dict[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in (variables | {"HOME": f"{tmp_path}"}).items():
+        monkeypatch.setenv(name, value)
+    settings = ExecutorSettings(executor="ray", ray_address="auto")
+    with pytest.raises(UsageError, match=message), open_executor(settings):
+        pass
 
 
 @NEEDS_RAY
