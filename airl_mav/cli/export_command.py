@@ -6,7 +6,6 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 from pydantic import Field
@@ -15,6 +14,7 @@ from rich.console import Console
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.addons import load_entry
 from airl_mav.core.errors import FieldError
+from airl_mav.core.files import scratch_folder
 from airl_mav.core.progress import new_console
 from airl_mav.policy import card_writing, registry
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
@@ -118,8 +118,8 @@ def _export_int8(options: ExportOptions) -> PolicyCard:
         "airl_mav", "EXPORTS", "int8", ("int8", True), "int8"
     )
     if options.own_module or Path(options.model).is_file():
-        with TemporaryDirectory(prefix="airl-export-") as scratch:
-            folder = Path(scratch) / name
+        with scratch_folder("airl-export-") as scratch:
+            folder = scratch / name
             _export(options.model_copy(update={"out": folder}))
             return write(folder, options.out, name=name)
     return write(_policy_folder(options), options.out, name=name)

@@ -12,7 +12,6 @@ import json
 import os
 import queue
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -24,7 +23,7 @@ from airl_mav.core.child_process import ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.files import replace_file, try_lock
+from airl_mav.core.files import replace_file, scratch_folder, try_lock
 from airl_mav.core.machine import usable_cores
 from airl_mav.core.progress import Bar, Progress
 
@@ -94,8 +93,8 @@ def compile_first(
             parts = plan.parts
             if any(map(_is_done, folder.glob(f"{plan.family}-*.json"))):
                 parts = ()
-            with tempfile.TemporaryDirectory(prefix="airl-compiling-") as scratch:
-                step = _Step(progress, stop, workers or usable_cores(), Path(scratch))
+            with scratch_folder("airl-compiling-") as scratch:
+                step = _Step(progress, stop, workers or usable_cores(), scratch)
                 files = step.run(parts, plan.whole)
             if files is not None:
                 _record(plan.record(folder), files)

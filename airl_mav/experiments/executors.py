@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
-import platform
 import signal
 import sys
 import threading
@@ -163,7 +162,7 @@ def check_versions(driver: Mapping[str, str]) -> None:
         if here.get(name) != driver.get(name)
     ]:
         raise UsageError(
-            f"the worker on {platform.node()} has other code: {'; '.join(different)}; accepted: the"
+            f"the worker on {os.uname().nodename} has other code: {'; '.join(different)}; accepted: the"
             " same versions on every machine, unchanged during the run"
         )
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import queue
-import shutil
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from airl_mav.core import child_process, clock, constants, errors, machine
+from airl_mav.core import child_process, clock, constants, errors, files, machine
 from airl_mav.faults import Fault
 from airl_mav.rehearsal.channel import Begin, Compiling, Due, Event, Failed, Ready, parse_event
 
@@ -106,7 +104,7 @@ class ProcessPair:
     def __init__(self) -> None:
         self._events: queue.Queue[tuple[str, Event | child_process.Exited]] = queue.Queue()
         self._children: dict[str, Child] = {}
-        self._scratch = ""
+        self._scratch = ExitStack()
         """Folder of the companion's temporary files. MAVSDK creates one folder per system, and
         leaves it behind when its process is killed."""
         self._clock = clock.WallClock()
@@ -119,8 +117,8 @@ class ProcessPair:
         self, begin: Begin, logs: Path, keeps: Sequence[int], compiling: Callable[[], None]
     ) -> None:
         """Start both processes and wait until they are ready. Raises UsageError or LostError."""
-        self._scratch = tempfile.mkdtemp(prefix="airl-companion-")
-        places = {COMPANION: {"TMPDIR": self._scratch}}
+        scratch = self._scratch.enter_context(files.scratch_folder("airl-companion-"))
+        places = {COMPANION: {"TMPDIR": f"{scratch}"}}
         for name, module in MODULES.items():
             log, place = logs / f"{name}.log", places.get(name)
             self._children[name] = child = Child(
@@ -154,8 +152,7 @@ class ProcessPair:
                 child.kill()
             raise
         finally:
-            if self._scratch:
-                shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch.close()
 
     def stop_one(self, name: str) -> None:
         """End one process, if it was started, and wait for its exit."""

@@ -181,7 +181,8 @@ class RunFolder:
         """Remove files of unfinished episodes, but keep the logs of a killed firmware."""
         for pattern in (".*.npz*", f"*{files.TEMPORARY_SUFFIX}"):
             for leftover in self.path.glob(pattern):
-                leftover.unlink()
+                if not leftover.is_dir():  # Of somebody else: temporary files are no folders.
+                    leftover.unlink()
         for log in self.path.glob(f"flight-*{PARTIAL_SUFFIX}"):
             log.rename(log.with_suffix(""))
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from airl_mav.core import constants, resource_use
-from airl_mav.core.machine import flown_with
+from airl_mav.core import constants, machine, resource_use
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.episode_record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.judge import Outcome
@@ -64,7 +63,7 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
         ("firmware", setup.firmware),
         ("speed", pace),
         ("between commands", setup.between_commands),
-        ("flown with", flown_with(episode.code for episode in run.episodes)),
+        ("flown with", machine.flown_with(episode.code for episode in run.episodes)),
         ("sha256 of the flights", run_sha256(run.episodes) or ""),
     ]
     return tuple((term, text) for term, text in rows if text)

@@ -16,8 +16,7 @@ from typing import Literal
 
 from pydantic import TypeAdapter
 
-from airl_mav.core import errors, files
-from airl_mav.core.machine import mixed_code
+from airl_mav.core import errors, files, machine
 from airl_mav.flight.episode_record import EpisodeRecord, Setup
 from airl_mav.flight.judge import BY_HAND, STRANGER, Outcome
 from airl_mav.flight.requirements import Finding, Requirement, RequirementDecision, find
@@ -278,5 +277,5 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     if setup.level == "sitl" and any(not each.startswith((BY_HAND, STRANGER)) for each in reasons):
         file = shlex.quote(str(run.path / SCENARIO_FILE))
         advice = f"To fly without real time, run: airl-sitl {file} --level lockstep"
-    sentences = verdict.sentences + mixed_code(each.code for each in episodes)
+    sentences = verdict.sentences + machine.mixed_code(each.code for each in episodes)
     return replace(verdict, sentences=sentences, advice=advice)

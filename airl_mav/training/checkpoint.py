@@ -32,6 +32,7 @@ from airl_mav.core.files import (
     Arrays,
     json_line,
     read_json,
+    remove,
     replace_file,
     replacing,
     save_arrays,
@@ -234,7 +235,7 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
     """Write a checkpoint with JSON data `meta`; return its folder. Keeps the previous one."""
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f"{PREFIX}*{PARTIAL}"):
-        shutil.rmtree(leftover)
+        remove(leftover)
     there = _all(folder)
     final = folder / f"{PREFIX}{_serial(there[-1]) + 1 if there else 1:06d}"
     partial = final.with_name(final.name + PARTIAL)
@@ -249,8 +250,7 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
     replace_file(folder / LATEST, f"{final.name}\n".encode())
     for old in _all(folder)[:-KEEP]:
         # A partly removed folder must not look like a checkpoint.
-        old.rename(old.with_name(old.name + PARTIAL))
-        shutil.rmtree(old.with_name(old.name + PARTIAL))
+        remove(old.rename(old.with_name(old.name + PARTIAL)))
     return final
 
 

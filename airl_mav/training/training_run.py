@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -20,7 +19,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.files import replace_file
+from airl_mav.core.files import replace_file, scratch_folder
 from airl_mav.core.machine import package_versions
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
 from airl_mav.envs.fleet import FlightStatus
@@ -137,8 +136,8 @@ def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> N
     if config.initial is not None:
         begin_with(model, Path(config.initial), None)
     if config.network.own or config.environment.layout not in SHIPPED:
-        with TemporaryDirectory() as scratch:
-            export.export_sb3(model, facts_of(config, name, "", 0), Path(scratch))
+        with scratch_folder("airl-train-") as scratch:
+            export.export_sb3(model, facts_of(config, name, "", 0), scratch)
 
 
 def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> NavigationVecEnv:

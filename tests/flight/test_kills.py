@@ -18,6 +18,7 @@ import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +219,7 @@ class Command:
         else:
             assert process.returncode in self.victim.ends, self.text()
         for each in family:
-            wait_until(lambda each=each: not runs(each), f"{each} to end", 30.0)
+            wait_until(partial(has_ended, each), f"{each} to end", 30.0)
         check_whole_files(self.out)
         return alive
 
@@ -231,12 +232,12 @@ class Command:
         assert "Traceback" not in self.text()
 
 
-def runs(process: psutil.Process) -> bool:
-    """Return True if a process runs; one without a parent that reaps it has ended, too."""
+def has_ended(process: psutil.Process) -> bool:
+    """Return True if a process has ended, reaped or not."""
     try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+        return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
-        return False
+        return True
 
 
 def check_whole_files(out: Path) -> None:

@@ -16,10 +16,10 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.machine import check_code, code_now, code_of, flown_with, mixed_code
 from airl_mav.experiments.campaign import load_campaign, open_campaign
 from airl_mav.experiments.executors import ProcessExecutor
+from airl_mav.rehearsal.run_folder import EPISODES_FILE, RUN_FILE, load, open_folder
 from airl_mav.report.comparison.show import compare_folders, judge_comparison
 from airl_mav.report.run_tables import setup_rows
 from airl_mav.report.run_verdict import verdict_of
-from airl_mav.rehearsal.run_folder import EPISODES_FILE, RUN_FILE, load, open_folder
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.training.config import TrainingConfig
@@ -29,7 +29,7 @@ from tests.support.campaign_kit import cells, declared
 from tests.support.run_demo import write_demo_run
 
 OTHER = {"numpy": "0.1"}
-MADE = {"versions": machine.package_versions(), "git": machine.git_state()}
+MADE: dict[str, Any] = {"versions": machine.package_versions(), "git": machine.git_state()}
 OLD = {**MADE, "versions": {**MADE["versions"], **OTHER}}
 ANOTHER_COMMIT = {**MADE, "git": {"commit": "0123456789abcdef", "changed": False}}
 

@@ -13,6 +13,7 @@ from airl_mav.addons.fault_matrix import matrix as fault_matrix
 from airl_mav.addons.fault_matrix.matrix import CASES, MATRIX_PHASES
 from airl_mav.core import clock, errors, fields, files, machine
 from airl_mav.core.progress import RichProgress, new_console
+from airl_mav.experiments import executors
 from airl_mav.faults import LINKS, PROCESSES, Fault, Phase
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.document import Column, TableView, print_table
@@ -96,10 +97,15 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
             fault_matrix.save(fault_matrix.with_cells(matrix, done), file)
             bar.update(completed=len(done) * len(seeds))
 
-        cells = fault_matrix.fly_matrix(
-            vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
-        )
-        bar.close()
+        try:
+            cells = fault_matrix.fly_matrix(
+                vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
+            )
+        except executors.WorkerError as error:
+            progress.note(f"{error}: resume with --out {out}", "red")
+            return errors.EXIT_BROKEN
+        finally:
+            bar.close()
     mixed = "".join(machine.mixed_code(each.code for cell in cells for each in cell.flights))
     text = fault_matrix.markdown(cells) + (f"\n{mixed}\n" if mixed else "")
     files.replace_file(out / "faults.md", text.encode())

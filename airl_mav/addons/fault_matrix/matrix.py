@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,8 +15,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import TypeAdapter
 
-from airl_mav.core import clock, constants, errors, files, frames
-from airl_mav.core.machine import check_code, code_now
+from airl_mav.core import clock, constants, errors, files, frames, machine
+from airl_mav.experiments.executors import ExecutorSettings, Stop, open_executor
 from airl_mav.faults import Fault, Phase
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
@@ -207,7 +205,7 @@ class _Flight:
         touchdown_m_s, farthest_m = max(self.touchdowns, default=None), round(self.farthest_m, 3)
         mode, texts = self.autopilot.flight.mode.name, tuple(dict.fromkeys(self.texts))
         result = end or "flying", touchdown_m_s, farthest_m, mode, texts
-        return FaultFlight(self.fault, self.phase, self.seed, *result, code=code_now())
+        return FaultFlight(self.fault, self.phase, self.seed, *result, code=machine.code_now())
 
     def _tick(self) -> End | None:
         """Fly a tick; return the end if the flight is over, otherwise None."""
@@ -376,21 +374,28 @@ def fly_matrix(
     }
     jobs = [(fault, phase) for fault in faults for phase in phases]
     missing = [job for job in jobs if job not in kept]
-    fly = partial(_fly_cell, vehicle, tuple(seeds))
     cells: list[MatrixCell] = []
-    # Spawned processes: pybullet and compiled kernels do not survive a fork beside threads.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context) if workers > 1 else None
-    with pool or nullcontext():
-        new = iter(map(fly, missing) if pool is None else pool.map(fly, missing))
+    fly = partial(_fly_cells, vehicle, tuple(seeds))
+    with (
+        open_executor(ExecutorSettings(workers=workers), in_process=True) as executor,
+        closing(executor.run(missing, fly, name=" ".join)) as new,
+    ):
         for job in jobs:
-            cells.append(kept.get(job) or next(new))
+            while job not in kept:  # Workers finish in any order.
+                done, cell = next(new)
+                kept[done] = cell
+            cells.append(kept[job])
             flown(cells[-1])
     return cells
 
 
-def _fly_cell(vehicle: VehicleProfile, seeds: Sequence[int], job: tuple[str, Phase]) -> MatrixCell:
-    return MatrixCell(*job, tuple(fly_fault(vehicle, *job, seed) for seed in seeds))
+def _fly_cells(
+    vehicle: VehicleProfile,
+    seeds: Sequence[int],
+    stop: Stop,  # noqa: ARG001 (a worker is killed)
+) -> Callable[[tuple[str, Phase]], list[MatrixCell]]:
+    """Return the function of a worker that flies a cell."""
+    return lambda job: [MatrixCell(*job, tuple(fly_fault(vehicle, *job, s) for s in seeds))]
 
 
 def markdown(cells: Sequence[MatrixCell]) -> str:
@@ -480,5 +485,5 @@ def resumed(
     if found.vehicle != vehicle:
         raise errors.UsageError(f"{path}: flown by another vehicle; accepted: another --out")
     flown = [flight.code for cell in found.cells for flight in cell.flights]
-    check_code(path, found.made, flown, mixed=mixed, say=say)
+    machine.check_code(path, found.made, flown, mixed=mixed, say=say)
     return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError, usage_errors
-from airl_mav.core.files import replace_file
+from airl_mav.core.files import replace_file, scratch_folder
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
 from airl_mav.experiments import gym_flier, hardware_gap
@@ -76,8 +75,8 @@ def quantised(model: bytes, frames: Encoded) -> bytes:
         def get_next(self) -> Mapping[str, NDArray[Any]] | None:
             return next(self.rows, None)
 
-    with tempfile.TemporaryDirectory(prefix="airl-int8-") as scratch, _quiet():
-        floats, shaped, written = (Path(scratch, f"{n}.onnx") for n in ("floats", "shaped", "int8"))
+    with scratch_folder("airl-int8-") as scratch, _quiet():
+        floats, shaped, written = (scratch / f"{n}.onnx" for n in ("floats", "shaped", "int8"))
         floats.write_bytes(model)
         try:
             quant_pre_process(floats, shaped, skip_symbolic_shape=True)

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock, processor_time_us
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
+from airl_mav.core.files import scratch_folder
 from airl_mav.core.progress import Bar
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.actions import flyable
@@ -65,11 +65,11 @@ def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
     vehicles = {name: load_vehicle(name) for name in names}
     layers = filters = vehicle = None
     name = request.policy or DEFAULT_POLICY
-    with TemporaryDirectory(prefix="airl-profile-") as scratch:
+    with scratch_folder("airl-profile-") as scratch:
         if request.network is not None:
             layers, filters = (int(size) for size in request.network.split("x"))
-            vehicle = _write_random_network(request, layers, filters, vehicles, Path(scratch))
-            name = scratch
+            vehicle = _write_random_network(request, layers, filters, vehicles, scratch)
+            name = f"{scratch}"
         info = find_policy(name, trust=request.trust)
         if info.card is None or info.folder is None:
             raise FieldError("policy", name, "a learned policy; this one has no network")

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from airl_mav.addons.profiling import measurement, policy_under_test
 from airl_mav.core.child_process import terminated_as_interrupted
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.files import scratch_folder
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal import channel, run_folder
@@ -116,8 +116,8 @@ def _flights(
 
 def _fly(scenario: ResolvedScenario, observer: DecisionEstimate) -> measurement.Stamps:
     """Fly once; return the stamps by the simulator's clock. Raises RehearsalError."""
-    with TemporaryDirectory(prefix="airl-profile-") as scratch:
-        path = Path(scratch) / "run"
+    with scratch_folder("airl-profile-") as scratch:
+        path = scratch / "run"
         folder = run_folder.RunFolder.create(
             path, "profile", {}, setup=scenario.setup, seeds=scenario.scenario.seeds
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import socket
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
@@ -19,6 +18,7 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
+from airl_mav.core.files import scratch_folder
 from airl_mav.core.progress import new_console
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
@@ -142,7 +142,7 @@ def shown_beside(
 @contextmanager
 def _shown(words: list[str], say: Callable[[str], None]) -> Iterator[None]:
     """Show the video within the context; flights continue if the video fails, with a message."""
-    with tempfile.TemporaryDirectory(prefix="airl-video-") as folder:
+    with scratch_folder("airl-video-") as folder:
         # The guard ends the video with its parent.
         command = [sys.executable, "-m", MODULE, *words]
         child = ChildProcess(command, Path(folder) / "video.log", guarded=True)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import zmq
 from pydantic import ValidationError
 
 from airl_mav.addons.view import view_messages
-from airl_mav.core import child_process, constants, errors
+from airl_mav.core import child_process, constants, errors, files
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.rehearsal.live_view import ViewAddresses, ViewError
 from airl_mav.scenario.resolve import ResolvedScenario
@@ -113,10 +111,11 @@ class Viewer:
 
     def __init__(self, request: view_messages.ViewSettings) -> None:
         """Start the viewer and wait for it; raise FieldError if the port is in use."""
-        self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
+        self._scratch = ExitStack()
+        folder = self._scratch.enter_context(files.scratch_folder("airl-view-"))
         self._child = child_process.ChildProcess(
             [sys.executable, "-m", MODULE],
-            Path(self._folder.name) / "view.log",
+            folder / "view.log",
             capture_stdout=True,
         )
         try:
@@ -152,7 +151,7 @@ class Viewer:
         self._child.stop()
         if self._child.stdout is not None:
             self._child.stdout.close()
-        self._folder.cleanup()
+        self._scratch.close()
 
 
 QUEUED = 64
