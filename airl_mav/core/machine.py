@@ -12,7 +12,6 @@ import os
 import platform
 import shutil
 import subprocess
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -235,6 +234,8 @@ SOURCES = "sources"
 NO_FLIGHT = ("airl-mav", "matplotlib", "pydantic", "pyzmq")
 """Versions without effect on flights; the sources stand for airl-mav."""
 
+UNKNOWN = "unknown code"
+
 ROOT = Path(__file__).resolve().parents[2]
 """Folder of the packages: the checkout, or site-packages."""
 
@@ -270,10 +271,12 @@ def code_of(made: Mapping[str, Any]) -> str:
 
     The fingerprint is equal for code with the same flights. The part from @ is missing without git.
     """
-    lines = sorted(f"{k} {v}\n" for k, v in made["versions"].items() if k not in NO_FLIGHT)
+    versions, git = made.get("versions"), made.get("git")
+    if not isinstance(versions, Mapping):
+        return UNKNOWN
+    lines = sorted(f"{k} {v}\n" for k, v in versions.items() if k not in NO_FLIGHT)
     fingerprint = hashlib.sha256("".join(lines).encode()).hexdigest()[:12]
-    git = made["git"]
-    return fingerprint if git is None else f"{fingerprint}@{git.get('commit')}"[:23]
+    return f"{fingerprint}@{git.get('commit')}"[:23] if isinstance(git, Mapping) else fingerprint
 
 
 @cache
@@ -302,19 +305,17 @@ def check_code(
     Raises:
         UsageError: Results of other code, unless `mixed`.
     """
-    held = dict.fromkeys((code_of(made), *(each or "unknown code" for each in flown)))
+    held = dict.fromkeys((code_of(made), *(each or UNKNOWN for each in flown)))
     others = [code for code in held if code != code_now()]
     if not others:
         return
-    line = f"{where}: flown with code {' and '.join(others)}; this is {code_now()}"
+    line = f"{where}: flown with code {' and '.join(others[:3])}; this is {code_now()}"
     if {code.partition("@")[0] for code in others} == {code_now().partition("@")[0]}:
         say(f"{line}: another commit, the same code of flights")
         return
-    old, now = made["versions"], package_versions()
-    changes = [
-        f"{k} {old.get(k)}, not {now.get(k)}" for k in {**old, **now} if old.get(k) != now.get(k)
-    ]
-    line += f" ({'; '.join(changes)})" if changes else ""
+    old, now = made.get("versions"), package_versions()
+    if isinstance(old, Mapping) and (changed := [k for k in now if old.get(k) != now[k]]):
+        line += f" ({'; '.join(f'{k} {old.get(k)}, not {now[k]}' for k in changed)})"
     if not mixed:
         raise UsageError(f"{line}; accepted: a new folder, the same code, or --mixed-code")
     say(f"{line}: goes on with several versions of the code")
@@ -322,16 +323,16 @@ def check_code(
 
 def flown_with(codes: Iterable[str | None]) -> str:
     """Return the code of flights as text; "" if it is unknown for all."""
-    counts = Counter(code or "unknown" for code in codes)
-    if len(counts) < 2:
-        return "".join(set(counts) - {"unknown"})
-    return ", ".join(f"{code} ({n:,} flights)" for code, n in counts.items())
+    known = [code or UNKNOWN for code in codes]
+    if len(set(known)) < 2:
+        return "".join(set(known) - {UNKNOWN})
+    return ", ".join(f"{each} ({known.count(each):,} flights)" for each in dict.fromkeys(known))
 
 
 def mixed_code(codes: Iterable[str | None]) -> tuple[str, ...]:
     """Return a sentence if flights have different code; else nothing."""
     codes = list(codes)
-    versions = len({(code or "unknown").partition("@")[0] for code in codes})
+    versions = len({(code or UNKNOWN).partition("@")[0] for code in codes})
     if versions < 2:
         return ()
     return (f"Flown with {versions} versions of the code: {flown_with(codes)}.",)

@@ -151,10 +151,7 @@ class Failure:
 
 
 def check_versions(driver: Mapping[str, str]) -> None:
-    """Raise UsageError if this worker's versions differ from those of the process that started it.
-
-    `driver` are that process's `package_versions`: a worker imports what its machine has now.
-    """
+    """Raise UsageError if this worker's versions differ from the driver's `package_versions`."""
     here = package_versions()
     if different := [
         f"{name} {here.get(name)}, not {driver.get(name)}"
@@ -162,8 +159,8 @@ def check_versions(driver: Mapping[str, str]) -> None:
         if here.get(name) != driver.get(name)
     ]:
         raise UsageError(
-            f"the worker on {os.uname().nodename} has other code: {'; '.join(different)}; accepted: the"
-            " same versions on every machine, unchanged during the run"
+            f"the worker on {os.uname().nodename} has other code: {'; '.join(different)}; accepted:"
+            " the same versions on every machine, unchanged during the run"
         )
 
 

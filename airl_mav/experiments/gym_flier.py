@@ -9,8 +9,7 @@ from typing import Any
 
 from airl_mav import faults, prediction
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.machine import code_now
+from airl_mav.core import constants, machine
 from airl_mav.envs.arena_batch import CEILING, FLOOR, WALL
 from airl_mav.envs.evaluation import (
     OUTCOMES,
@@ -164,7 +163,7 @@ class GymFlier:
         outcome = OUTCOMES[flown.verdict]
         flights, trajectory = navigation.flights(), trace.trajectory(slot)
         latency = trace.latency(slot)
-        ended_us = round(flown.flight_time_s * US_PER_S)
+        ended_us = round(flown.flight_time_s * constants.US_PER_S)
         record = EpisodeRecord(
             index=index,
             seed=flown.seed,
@@ -195,7 +194,7 @@ class GymFlier:
             faults=tuple(
                 FaultActed(*each) for each in acted(self.scenario.scenario.faults, ended_us)
             ),
-            code=code_now(),
+            code=machine.code_now(),
         )
         return FlownEpisode(record, trajectory, latency)
 

@@ -91,6 +91,12 @@ def test_other_code_of_a_single_flight_is_refused() -> None:
             check_code("x", MADE, [code_now(), other], mixed=False)
 
 
+@pytest.mark.parametrize("made", [{}, {"versions": 7, "git": 7}, {"versions": {"numpy": []}}])
+def test_a_damaged_provenance_is_unknown_code(made: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=r"^x: flown with code .*--mixed-code$"):
+        check_code("x", made, mixed=False)
+
+
 def scenario(**changes: Any) -> Scenario:
     return Scenario(level="gym", policy="greedy", arena="no-obstacles", seed=7, **changes)
 

@@ -10,7 +10,6 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.addons.fault_matrix import matrix as fault_matrix
-from airl_mav.addons.fault_matrix.matrix import CASES, MATRIX_PHASES
 from airl_mav.core import clock, errors, fields, files, machine
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.experiments import executors
@@ -40,7 +39,7 @@ class FaultsOptions(fields.ProfileModel):
         description="faults in words, without a time; by default those of the catalogue",
     )
     phases: tuple[str, ...] = Field(
-        default=MATRIX_PHASES, description="phases of the flight in which they begin"
+        default=fault_matrix.MATRIX_PHASES, description="phases of the flight in which they begin"
     )
     episodes: int = fields.quantity(
         "flights with each fault in each phase", "1", ge=1, le=10_000, default=20
@@ -74,7 +73,9 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     """Fly the matrix, show and save it; return 0 if every flight ended as documented, else 3."""
     console = console or new_console()
     phases = tuple(_phase(name) for name in options.phases)
-    faults = [_without_time(fault) for fault in options.faults] or [c.fault for c in CASES]
+    faults = [_without_time(fault) for fault in options.faults] or [
+        c.fault for c in fault_matrix.CASES
+    ]
     seeds = range(options.seed, options.seed + options.episodes)
     workers = options.workers or machine.usable_cores()
     vehicle = load_vehicle(options.vehicle)
@@ -131,10 +132,10 @@ def table_of(
 
 def _phase(name: str) -> Phase:
     for phase in get_args(Phase):
-        if phase == name and phase in MATRIX_PHASES:
+        if phase == name and phase in fault_matrix.MATRIX_PHASES:
             known: Phase = phase
             return known
-    raise errors.FieldError("phases", name, ", ".join(MATRIX_PHASES))
+    raise errors.FieldError("phases", name, ", ".join(fault_matrix.MATRIX_PHASES))
 
 
 def _without_time(fault: Fault) -> str:

@@ -477,7 +477,7 @@ def resumed(
 ) -> Matrix:
     """Return a stopped run's matrix, or an empty one.
 
-    Raises UsageError for another vehicle's matrix, or one of other code unless `mixed`.
+    Raises UsageError for another vehicle's matrix, and for other code unless `mixed`.
     """
     if not path.exists():
         return Matrix(dict(made), vehicle, ())

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from airl_mav.addons.profiling import measurement, policy_under_test
+from airl_mav.core import constants, files
 from airl_mav.core.child_process import terminated_as_interrupted
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.files import scratch_folder
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal import channel, run_folder
@@ -35,7 +34,7 @@ class DecisionEstimate(LiveObserver):
     def __init__(self, bar: Bar, period_s: float, before: int) -> None:
         """Start from the decisions of earlier flights; one more is made every period."""
         super().__init__(Progress(), Path(), (), 1)
-        self._decisions, self._period_us, self._before = bar, period_s * US_PER_S, before
+        self._decisions, self._period_us, self._before = bar, period_s * constants.US_PER_S, before
         self._navigating_us: int | None = None
 
     def phase(self, phase: str, time_us: int) -> None:
@@ -68,7 +67,7 @@ def measure(
     )
     # A hold shorter than a frame's interval waits for the next frame.
     frame_s = 1.0 / scenario.vehicle.camera.rate_hz
-    period_s = max(request.hold_s + later_us / US_PER_S, frame_s)
+    period_s = max(request.hold_s + later_us / constants.US_PER_S, frame_s)
     with terminated_as_interrupted():
         try:
             flights = tuple(_flights(request, scenario, period_s, bar))
@@ -111,12 +110,12 @@ def _flights(
             )
         yield {name: column[request.warm_up : wanted] for name, column in stamps.items()}
         count, number = count + min(rows, wanted) - request.warm_up, number + 1
-        period_s = float(np.diff(stamps["sent_us"]).mean()) / US_PER_S
+        period_s = float(np.diff(stamps["sent_us"]).mean()) / constants.US_PER_S
 
 
 def _fly(scenario: ResolvedScenario, observer: DecisionEstimate) -> measurement.Stamps:
     """Fly once; return the stamps by the simulator's clock. Raises RehearsalError."""
-    with scratch_folder("airl-profile-") as scratch:
+    with files.scratch_folder("airl-profile-") as scratch:
         path = scratch / "run"
         folder = run_folder.RunFolder.create(
             path, "profile", {}, setup=scenario.setup, seeds=scenario.scenario.seeds

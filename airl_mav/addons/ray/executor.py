@@ -6,7 +6,6 @@ import hashlib
 import logging
 import os
 import pickle
-import secrets
 import socket
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -144,7 +143,7 @@ def _require_token(address: str) -> None:
         )
     file = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
     if address == LOCAL:
-        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        os.environ.setdefault("RAY_AUTH_TOKEN", os.urandom(32).hex())
     elif not os.environ.get("RAY_AUTH_TOKEN") and not (file.is_file() and file.read_text().strip()):
         problem = f"no token in RAY_AUTH_TOKEN or {file}; accepted: the token of the cluster"
         raise FieldError("ray_address", address, problem=problem)

@@ -14,11 +14,10 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
+from airl_mav.core import constants, files
 from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError
-from airl_mav.core.files import scratch_folder
 from airl_mav.core.progress import new_console
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
@@ -115,7 +114,7 @@ def video_words(asked: model.Scenario, to: str) -> list[str]:
     ports = asked.open_ports
     if ports.camera_port == 0:
         raise FieldError("video", to, problem="accepted: with a camera port of your choice, not 0")
-    camera = f"tcp://{LOOPBACK}:{ports.camera_port}"
+    camera = f"tcp://{constants.LOOPBACK}:{ports.camera_port}"
     words = ["--camera", camera, "--vehicle", asked.vehicle, "--to", to]
     if asked.camera_key is not None:
         words += ["--camera-key", str(asked.camera_key)]
@@ -125,9 +124,9 @@ def video_words(asked: model.Scenario, to: str) -> list[str]:
 def _network(asked: model.Scenario) -> str | None:
     """Return the camera's connection to the vehicle; None for a signed link or other firmware."""
     if asked.firmware == "px4":
-        return f"udpin://{LOOPBACK}:{GIMBAL_PORT + asked.real.instance}"
+        return f"udpin://{constants.LOOPBACK}:{GIMBAL_PORT + asked.real.instance}"
     if asked.firmware == "builtin" and asked.signing_key is None:
-        return f"udpout://{LOOPBACK}:{asked.open_ports.gcs_local_port}"
+        return f"udpout://{constants.LOOPBACK}:{asked.open_ports.gcs_local_port}"
     return None
 
 
@@ -142,7 +141,7 @@ def shown_beside(
 @contextmanager
 def _shown(words: list[str], say: Callable[[str], None]) -> Iterator[None]:
     """Show the video within the context; flights continue if the video fails, with a message."""
-    with scratch_folder("airl-video-") as folder:
+    with files.scratch_folder("airl-video-") as folder:
         # The guard ends the video with its parent.
         command = [sys.executable, "-m", MODULE, *words]
         child = ChildProcess(command, Path(folder) / "video.log", guarded=True)
