@@ -15,10 +15,10 @@ import subprocess
 import sys
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,13 @@ from tests.support.campaign_kit import same_runs
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, wait_until, write_arena
 from tests.support.sweep_kit import TINY
+
+pytestmark = [
+    pytest.mark.nightly,
+    pytest.mark.slow,
+    pytest.mark.timeout(1800),
+    pytest.mark.xdist_group("kills"),
+]
 
 KILLS = int(os.environ.get("AIRL_KILLS", "10"))
 SEED = 50
@@ -206,11 +213,12 @@ VICTIMS = {
 class Zygote:
     """Process that forks for each command line: kills are many, imports are slow."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, inside: Sequence[str] = ()) -> None:
+        """Start the process, by a command that runs its last arguments if given."""
         environment = {**os.environ, "PYTHONPATH": f"{ROOT}", "COLUMNS": "200"}
         environment |= {"MPLCONFIGDIR": get_cachedir()}
         self._process = subprocess.Popen(
-            [sys.executable, "-c", ZYGOTE, *MODULES],
+            [*inside, sys.executable, "-c", ZYGOTE, *MODULES],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -233,6 +241,11 @@ class Zygote:
         assert self._process.stdout is not None
         return self._process.stdout.readline()
 
+    @property
+    def pid(self) -> int:
+        """The process."""
+        return self._process.pid
+
     def close(self) -> None:
         """End the process."""
         self._process.communicate(timeout=60.0)
@@ -251,9 +264,10 @@ class Command:
     def __init__(self, zygote: Zygote, folder: Path, victim: Victim, out: str) -> None:
         self.zygote, self.folder, self.victim = zygote, folder, victim
         self.out = folder / out
-        self.scratch = folder / f"{out}-tmp"
+        name = out.replace("/", "-")
+        self.scratch = folder / f"{name}-tmp"
         self.scratch.mkdir(exist_ok=True)
-        self.log = folder / f"{out}.txt"
+        self.log = folder / f"{name}.txt"
 
     def start(self) -> int:
         """Start the command; return its process."""
@@ -324,16 +338,26 @@ def check_whole_files(out: Path) -> None:
                 assert archive.testzip() is None
 
 
-@pytest.mark.nightly
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
+@pytest.fixture(scope="module")
+def straight(
+    zygote: Zygote, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], tuple[Path, float]]:
+    """Return the folder of an undisturbed run, and its duration [s]."""
+
+    @cache
+    def run(name: str) -> tuple[Path, float]:
+        folder = tmp_path_factory.mktemp(f"straight-{name}")
+        command = Command(zygote, folder, VICTIMS[name], "run")
+        return command.out, command.finish()
+
+    return run
+
+
 @pytest.mark.parametrize("name", VICTIMS)
 def test_killed_at_any_moment_results_are_the_same(
-    zygote: Zygote, tmp_path: Path, name: str
+    zygote: Zygote, straight: Callable[[str], tuple[Path, float]], tmp_path: Path, name: str
 ) -> None:
-    victim = VICTIMS[name]
-    straight = Command(zygote, tmp_path, victim, "straight")
-    duration_s = straight.finish()
+    victim, (undisturbed, duration_s) = VICTIMS[name], straight(name)
     chance = random.Random(f"{name}-{SEED}")
     kills = runs = 0
     while kills < KILLS:
@@ -345,7 +369,78 @@ def test_killed_at_any_moment_results_are_the_same(
             kills += 1
         killed.finish()
         killed.nothing_left()
-        victim.check(killed.out, straight.out)
+        victim.check(killed.out, undisturbed)
         runs += 1
         sys.stdout.write(f"{name}: {kills} kills in {runs} runs of {duration_s:.1f} s\n")
         sys.stdout.flush()
+
+
+PAGE_BYTES = 4096
+
+MOUNT = 'mount -t tmpfs -o size=$1 tmpfs "$2" && shift 2 && exec "$@"'
+"""Shell command: mount a disk of a size, and continue inside."""
+
+
+class Disk:
+    """Small disk, seen by one zygote only."""
+
+    def __init__(self, folder: Path, size_bytes: int) -> None:
+        self.folder = folder / "disk"
+        self.folder.mkdir()
+        shell = ["unshare", "-rm", "bash", "-c", MOUNT, "mount"]
+        self.zygote = Zygote(folder, [*shell, f"{size_bytes}", f"{self.folder}"])
+
+    @property
+    def seen(self) -> Path:
+        """Path of the disk's content for this process."""
+        return Path(f"/proc/{self.zygote.pid}/root{self.folder}")
+
+    def remount(self, options: str) -> None:
+        """Change the disk's size, or make it read-only."""
+        words = ["nsenter", "-t", f"{self.zygote.pid}", "-U", "-m", "--preserve-credentials"]
+        remount = ["mount", "-o", f"remount,{options}", f"{self.folder}"]
+        subprocess.run([*words, *remount], check=True)
+
+
+def has_namespaces() -> bool:
+    """Return True if this machine lets users mount a disk of their own."""
+    told = subprocess.run(
+        ["unshare", "-rm", "mount", "-t", "tmpfs", "tmpfs", "/mnt"],
+        capture_output=True,
+        check=False,
+    )
+    return told.returncode == 0
+
+
+@pytest.mark.parametrize("name", VICTIMS)
+def test_full_and_read_only_disks_are_told_in_one_line(
+    straight: Callable[[str], tuple[Path, float]], tmp_path: Path, name: str
+) -> None:
+    if not has_namespaces():
+        pytest.skip("no user namespaces here")
+    victim, (undisturbed, _) = VICTIMS[name], straight(name)
+    sizes = [path.stat().st_size for path in undisturbed.rglob("*") if path.is_file()]
+    pages = sum(-(-size // PAGE_BYTES) for size in sizes)
+    disk = Disk(tmp_path, max(pages // 2, 1) * PAGE_BYTES)
+    command = Command(disk.zygote, tmp_path, victim, "disk/run")
+    try:
+        command.start()
+        check_told(command, disk.zygote.status(), "No space left on device")
+        check_whole_files(disk.seen / "run")
+        disk.remount("size=64m")
+        command.finish()
+        victim.check(disk.seen / "run", undisturbed)
+        disk.remount("ro")
+        refused = Command(disk.zygote, tmp_path, victim, "disk/new")
+        refused.start()
+        check_told(refused, disk.zygote.status(), "Read-only file system")
+    finally:
+        disk.zygote.close()
+
+
+def check_told(command: Command, status: int, reason: str) -> None:
+    """Fail unless a command ended with one line that contains the reason."""
+    assert status not in (0, -signal.SIGKILL), command.text()
+    assert "Traceback" not in command.text()
+    lines = [line for line in command.text().splitlines() if reason in line]
+    assert len(lines) == 1, command.text()
