@@ -162,14 +162,11 @@ def sha256_of(path: Path) -> str:
 
 @contextmanager
 def scratch_folder(prefix: str) -> Iterator[Path]:
-    """Yield a new folder for temporary files, and remove those that killed processes left.
-
-    A lock marks the folder of a living process.
-    """
+    """Yield a new folder for temporary files, and remove those that killed processes left."""
     for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
         with suppress(OSError), _opened_folder(left) as descriptor:
             if os.fstat(descriptor).st_uid == os.getuid():
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # Fails if in use.
                 shutil.rmtree(left)
     new = Path(tempfile.mkdtemp(prefix=f"new-{prefix}"))
     with _opened_folder(new) as descriptor:

@@ -242,10 +242,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @cache
 def sources_digest() -> str:
-    """Return the digest of all code that decides flights, hexadecimal.
-
-    Commands and reports only read flights. Runs contain the digests of their profiles.
-    """
+    """Return the digest of all code that decides flights, without commands and reports."""
     digests = sorted(
         hashlib.sha256(file.read_bytes()).digest()
         for package in ("airl_mav", "companion", "firmware_sim")

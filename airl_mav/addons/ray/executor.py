@@ -132,17 +132,14 @@ def _check_reachable(address: str) -> None:
 
 
 def _require_token(address: str) -> None:
-    """Turn Ray's token authentication on; raise UsageError if a cluster's token is missing.
-
-    A local instance gets a new token that only this process and its workers have.
-    """
+    """Turn Ray's token authentication on; raise UsageError if a cluster's token is missing."""
     mode = os.environ.setdefault("RAY_AUTH_MODE", "token")
     if mode != "token":
         raise FieldError(
             "RAY_AUTH_MODE", mode, "token: Ray runs the code of everyone who reaches it"
         )
     file = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
-    if address == LOCAL:
+    if address == LOCAL:  # Only this process and its workers have the token.
         os.environ.setdefault("RAY_AUTH_TOKEN", os.urandom(32).hex())
     elif not os.environ.get("RAY_AUTH_TOKEN") and not (file.is_file() and file.read_text().strip()):
         problem = f"no token in RAY_AUTH_TOKEN or {file}; accepted: the token of the cluster"
