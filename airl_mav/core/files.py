@@ -1,11 +1,12 @@
 """Files that survive kills, full disks and bit errors: atomic writes, checked reads.
 
 A file is written under a temporary name, synced to the disk and renamed. A reader sees the old file
-or the complete new file. A run folder may come from an untrusted source: links in it are replaced
-or rejected. JSON objects contain their CRC-32 in the field `crc32`; archive members have a CRC by
-format. Damaged data is rejected on reading with one line. Files without the field, by earlier
-versions of this package or edited by hand, are read unchecked. A `LogFile` grows during a flight,
-under a temporary name until it is complete.
+or the complete new file. Lines and arrays of a run are appended; the end that a kill cut short is
+ignored. A run folder may come from an untrusted source: links in it are replaced or rejected. JSON
+objects contain their CRC-32 in the field `crc32`; archive members have a CRC by format. Damaged
+data is rejected on reading with one line. Files without the field, by earlier versions of this
+package or edited by hand, are read unchecked. A `LogFile` grows during a flight, under a temporary
+name until it is complete.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ import os
 import secrets
 import shutil
 import stat
+import struct
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal, NoReturn, TypeVar
+from typing import IO, Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +119,7 @@ def open_to_append(path: Path, mode: int = 0o666) -> IO[bytes]:
         descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, mode)
         found = os.fstat(descriptor)
         if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
-            return os.fdopen(descriptor, "ab")
+            return os.fdopen(descriptor, "a+b")
         os.close(descriptor)
     except OSError as error:
         if error.errno not in (errno.EISDIR, errno.ELOOP, errno.ENXIO):
@@ -243,15 +245,22 @@ def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
     """
     data = b"".join(json_line(each) for each in objects)
     with naming(path), open_to_append(path) as file:
-        before = file.tell()
-        try:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        except OSError:
-            with suppress(OSError):
-                os.ftruncate(file.fileno(), before)
-            raise
+        _append(file, data)
+
+
+def _append(file: IO[bytes], data: bytes) -> None:
+    """Append bytes to a file and sync it, or leave it unchanged. Raises OSError."""
+    before = file.seek(0, os.SEEK_END)
+    view = memoryview(data)
+    try:
+        # Unbuffered: what failed must not be written when the file is closed.
+        while view:
+            view = view[os.write(file.fileno(), view) :]
+        os.fsync(file.fileno())
+    except OSError:
+        with suppress(OSError):
+            os.ftruncate(file.fileno(), before)
+        raise
 
 
 def json_line(data: Mapping[str, Any]) -> bytes:
@@ -368,38 +377,54 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> dict[str, str]:
-    """Add groups of arrays to an .npz, created if missing; return the CRC of each group.
+    """Append groups of arrays to an .npz, created if missing; return the CRC of each group.
 
-    Keys become `<group>/<name>`. Existing arrays of these groups are replaced. The update is
-    atomic. The old archive is copied as bytes and appended to, which avoids a second compression of
-    the whole run.
+    Keys become `<group>/<name>`. Only the new arrays are written: `read_groups` needs no directory,
+    and other programs need the one of `close_archive`. Raises as `append_lines`.
     """
-    with replacing(path) as partial:
-        if path.exists():
-            shutil.copyfile(path, partial)
-        with _archive(partial, "a") as new:
-            stale = any(_group_of(member) in groups for member in new.infolist())
-            if not stale:
-                _write_groups(new, groups)
-                members = new.infolist()
-        if stale:
-            # Arrays of an episode that was killed and flown again.
-            with _archive(partial, "w") as new:
-                _copy_others(path, new, groups)
-                _write_groups(new, groups)
-                members = new.infolist()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
+        for group, arrays in groups.items():
+            for name, array in arrays.items():
+                with new.open(f"{group}/{name}.npy", "w") as stream:
+                    np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+        # Without the directory, which follows at the end of the block.
+        entries, members = buffer.getvalue(), new.infolist()
+    with naming(path), open_to_append(path) as file:
+        file.seek(max(0, file.tell() - _END_SIZE))
+        if file.read(len(_END)) == _END:
+            file.seek(0)
+            file.truncate(_archive(file.read()).start_dir)
+        _append(file, entries)
     return {
         group: _group_crc([member for member in members if _group_of(member) == group])
         for group in groups
     }
 
 
-def read_groups(path: Path) -> dict[str, ArrayGroup]:
-    """Return all groups of arrays in an archive, empty without a file. Raises UsageError."""
+def close_archive(path: Path, groups: Collection[str]) -> None:
+    """Remove all but some groups, and an array cut short; write the directory. Raises as above."""
+    with naming(path), open_to_append(path) as file:
+        file.seek(0)
+        data, whole = file.read(), io.BytesIO()
+        with _archive(data, groups, whole) as archive:
+            entries = archive.start_dir
+        if not data.startswith(whole.getbuffer()[:entries]):
+            replace_file(path, whole.getvalue())
+        elif data != whole.getvalue():
+            file.truncate(entries)
+            _append(file, whole.getvalue()[entries:])
+
+
+def read_groups(path: Path, groups: Collection[str]) -> dict[str, ArrayGroup]:
+    """Return groups of arrays in an archive, empty without a file. Raises UsageError.
+
+    An archive without its directory, or with an array cut short by a kill, is read as well.
+    """
     if not path.exists():
         return {}
     try:
-        with zipfile.ZipFile(path) as archive:
+        with _archive(path.read_bytes(), groups) as archive:
             members: dict[str, list[zipfile.ZipInfo]] = {}
             for member in archive.infolist():
                 members.setdefault(_group_of(member), []).append(member)
@@ -414,25 +439,40 @@ def read_groups(path: Path) -> dict[str, ArrayGroup]:
         raise UsageError(f"{path}: damaged: {' '.join(str(error).split())[:200]}") from None
 
 
-def _archive(path: Path, mode: Literal["a", "w"]) -> zipfile.ZipFile:
-    return zipfile.ZipFile(path, mode, zipfile.ZIP_DEFLATED, compresslevel=1)
+_HEAD, _ZIP64 = struct.Struct("<4s2xHH4xLLLHH"), struct.Struct("<4xQQ")
+"""Head of a member: signature, flags, method, CRC, packed size, size, lengths of name and extra
+field; extra field for sizes above 4 GB, which NumPy always writes."""
+
+_END, _END_SIZE = b"PK\5\6", 22
+"""Signature and size of the record after the directory."""
 
 
-def _copy_others(
-    path: Path, new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArray[Any]]]
-) -> None:
-    """Copy the members of all other groups."""
-    with zipfile.ZipFile(path) as old:
-        for member in old.infolist():
-            if _group_of(member) not in groups:
-                new.writestr(member, old.read(member))
-
-
-def _write_groups(new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
-    for group, arrays in groups.items():
-        for name, array in arrays.items():
-            with new.open(f"{group}/{name}.npy", "w", force_zip64=True) as stream:
-                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+def _archive(
+    data: bytes, groups: Collection[str] | None = None, whole: io.BytesIO | None = None
+) -> zipfile.ZipFile:
+    """Copy the complete members of groups, None = all, by their heads, into an open archive."""
+    whole, start = whole or io.BytesIO(), 0
+    archive = zipfile.ZipFile(whole, "w")
+    while len(data) - start >= _HEAD.size:
+        signature, flags, method, crc, packed, size, *lengths = _HEAD.unpack_from(data, start)
+        name = start + _HEAD.size
+        extra = name + lengths[0]
+        if packed == 0xFFFF_FFFF and lengths[1] >= _ZIP64.size <= len(data) - extra:
+            size, packed = _ZIP64.unpack_from(data, extra)
+        end = extra + lengths[1] + packed
+        # A directory, or an array that a kill cut short.
+        if signature != b"PK\3\4" or end > len(data):
+            break
+        member = zipfile.ZipInfo(data[name:extra].decode(errors="replace"))
+        member.flag_bits, member.compress_type, member.CRC = flags, method, crc
+        member.compress_size, member.file_size = packed, size
+        member.header_offset, member.external_attr = whole.tell(), 0o600 << 16
+        if groups is None or _group_of(member) in groups:
+            whole.write(data[start:end])
+            archive.filelist.append(member)
+        start = end
+    archive.start_dir = whole.tell()
+    return archive
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:

@@ -68,8 +68,11 @@ class EpisodeSaver:
             self._ending = True
             self._changed.notify_all()
         self._thread.join()
-        if error is None:
-            self._raise_error()
+        try:
+            if error is None:
+                self._raise_error()
+        finally:
+            self._folder.close()
 
     def add(self, episode: FlownEpisode) -> None:
         """Add an episode; blocks while the queue is full. Raises the error of a failed save."""

@@ -104,6 +104,7 @@ def fly_live(
         finally:
             live.close()
             folder.sweep()
+            folder.close()
         tell_end(folder.path, ended, problem, progress)
         new = live.finished_records
         episodes = tuple(sorted((*done, *new), key=lambda record: record.index))

@@ -144,18 +144,25 @@ class RunFolder:
         return cls.adopt(path, info, "--out ")
 
     @classmethod
-    def adopt(cls, path: Path, info: RunInfo, option: str = "") -> RunFolder:
+    def adopt(
+        cls, path: Path, info: RunInfo, option: str = "", *, episodes: Sequence[FlownEpisode] = ()
+    ) -> RunFolder:
         """Create the folder of a run from elsewhere. Raises UsageError, after the option's name."""
         with usage_errors(f"{option}{path}"):
             path.mkdir(parents=True, exist_ok=True)
         _write_info(path / RUN_FILE, info)
-        return cls(path)
+        folder = cls(path)
+        if episodes:
+            folder.save_episodes(episodes)
+            folder.close()
+        return folder
 
     @classmethod
     def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
-        """Open a killed run, cut off a half-written line, and return its contents."""
+        """Open a killed run, remove half-written data, and return its contents."""
         run = load(path)
         files.cut_torn_line(path / EPISODES_FILE)
+        cls(path).close()
         return cls(path), run
 
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
@@ -168,7 +175,7 @@ class RunFolder:
         return self.path / f"flight-{index:03d}.tlog"
 
     def forget(self, indices: Collection[int]) -> None:
-        """Remove the lines of episodes; arrays without a line are ignored."""
+        """Remove the lines and the arrays of episodes."""
         path = self.path / EPISODES_FILE
         kept = [
             line
@@ -176,6 +183,15 @@ class RunFolder:
             if json.loads(line)["index"] not in indices
         ]
         files.replace_file(path, b"".join(kept))
+        self.close()
+
+    def close(self) -> None:
+        """Remove arrays without a line, and write the directories of the two archives."""
+        lines = files.read_lines(self.path / EPISODES_FILE, LINE_SCHEMA)
+        groups = {f"{line['index']:03d}" for _, line in lines}
+        for name in (TRAJECTORIES_FILE, LATENCY_FILE):
+            if os.path.lexists(self.path / name):
+                files.close_archive(self.path / name, groups)
 
     def sweep(self) -> None:
         """Remove files of unfinished episodes, but keep the logs of a killed firmware."""
@@ -314,7 +330,7 @@ def _write_info(path: Path, info: RunInfo) -> None:
 
 def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, files.Arrays]:
     """Return the arrays of the episodes with a line, by index. Raises UsageError if damaged."""
-    groups = files.read_groups(path)
+    groups = files.read_groups(path, {f"{index:03d}" for index in crcs})
     found = {}
     for index, crc in crcs.items():
         group = groups.get(f"{index:03d}", files.NO_ARRAYS)

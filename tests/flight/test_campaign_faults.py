@@ -64,26 +64,26 @@ def after(owner, name):
         die()
     setattr(owner, name, deadly)
 
-def is_lines(descriptor):
-    return os.readlink(f"/proc/self/fd/{descriptor}").endswith("episodes.jsonl")
-
-def tear(descriptor):
-    real(descriptor)
-    if is_lines(descriptor):
-        os.ftruncate(descriptor, os.fstat(descriptor).st_size - 40)
-        die()
-
-real = os.fsync
+def tear(name):
+    real = os.fsync
+    def deadly(descriptor):
+        real(descriptor)
+        if os.readlink(f"/proc/self/fd/{descriptor}").endswith(name):
+            os.ftruncate(descriptor, os.fstat(descriptor).st_size - 40)
+            die()
+    os.fsync = deadly
 """
 
 WINDOWS = {
     "the settings half written": "before(atomic, 'sync', lambda p: p.name.startswith('run.json.'))",
     "no scenario file": "before(atomic, 'sync', lambda p: p.name.startswith('scenario.toml.'))",
     "nothing saved": "before(run_folder.RunFolder, 'save_episodes')",
-    "half an archive": "before(atomic, 'sync', lambda p: p.name.startswith('latency.npz.'))",
+    "half an archive": "tear('latency.npz')",
     "one archive": "after(atomic, 'add_arrays')",
-    "half a line": "os.fsync = tear",
+    "half a line": "tear('episodes.jsonl')",
     "a line": "after(run_folder.RunFolder, 'save_episodes')",
+    "no directory": "before(run_folder.RunFolder, 'close')",
+    "a directory": "after(atomic, 'close_archive')",
 }
 """Moments at which a harness dies while saving, named by the content on disk."""
 

@@ -25,6 +25,7 @@ from PIL import Image
 
 from airl_mav.arena.generate import generate
 from airl_mav.core.errors import EXIT_INVALID, UsageError
+from airl_mav.core.files import read_groups
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
 from airl_mav.experiments import campaign, gym_flier
@@ -547,11 +548,11 @@ def test_a_crash_between_arrays_and_lines_doubles_nothing(
 
     with monkeypatch.context() as patched:
         patched.setattr(RunFolder, "save_episodes", save)
+        patched.setattr(RunFolder, "close", lambda folder: None)
         with pytest.raises(OSError, match="the machine is gone"):
             evaluate("greedy", **options)
     monkeypatch.setattr(run_folder, "EPISODES_FILE", "episodes.jsonl")
-    with np.load(out / "trajectories.npz") as archive:
-        assert len({name.partition("/")[0] for name in archive.files}) == 20
+    assert len(read_groups(out / "trajectories.npz", {f"{i:03d}" for i in range(40)})) == 20
     lines = (out / "episodes.jsonl").read_bytes()
     # Nor does half a line matter.
     (out / "episodes.jsonl").write_bytes(lines[: lines.rfind(b"\n", 0, -1) + 30])

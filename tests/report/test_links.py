@@ -124,6 +124,13 @@ def test_lines_are_not_appended_to_links(plant: Plant, run: Path) -> None:
         files.append_lines(run / EPISODES_FILE, [{"schema": 1}])
 
 
+def test_arrays_are_not_appended_to_links(plant: Plant, run: Path) -> None:
+    plant(run / "latency.npz")
+    for write in (WRITERS["latency.npz"], lambda path: files.close_archive(path, {"000"})):
+        with pytest.raises(UsageError, match=rf"latency\.npz: {REFUSED}"):
+            write(run / "latency.npz")
+
+
 def test_a_resumed_run_does_not_truncate_links(plant: Plant, run: Path) -> None:
     plant(run / EPISODES_FILE)
     with pytest.raises(UsageError, match=f"{EPISODES_FILE}: {REFUSED}"):

@@ -159,6 +159,7 @@ def write_demo_run(
     for index, arena in arenas.items():
         limit_s = 12.0 if index == 3 else 40.0
         folder.save_episodes([FlownEpisode(*demo_episode(index, arena, time_limit_s=limit_s))])
+    folder.close()
     return folder, arenas
 
 

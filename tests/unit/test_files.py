@@ -101,7 +101,7 @@ def test_a_file_cut_short_emptied_or_of_another_run_is_refused(
     shutil.copytree(run, copy)
     data = (run / name).read_bytes()
     if name != EPISODES_FILE:  # That one may end anywhere: a kill cuts it short.
-        for short in (b"", data[:-1], data[: len(data) // 2]):
+        for short in (b"", data[: data.index(b"PK\1\2") - 1], data[: len(data) // 2]):
             (copy / name).write_bytes(short)
             with pytest.raises(UsageError, match=name):
                 load(copy)
@@ -198,4 +198,4 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, job: str) -> N
     assert done.stdout == f"{path}: File too large\n"
     assert [each.name for each in tmp_path.iterdir()] == ["x"]
     assert path.read_bytes() == before
-    assert read_groups(path) if job == "add" else read_lines(path, None)
+    assert read_groups(path, {"000"}) if job == "add" else read_lines(path, None)

@@ -13,10 +13,17 @@ import numpy as np
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import add_arrays, json_line, replace_file
+from airl_mav.core.files import add_arrays, close_archive, json_line, read_groups, replace_file
 from airl_mav.core.machine import git_state
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.rehearsal.run_folder import EPISODES_FILE, LATENCY_FILE, FlownEpisode, RunFolder, load
+from airl_mav.rehearsal.run_folder import (
+    EPISODES_FILE,
+    LATENCY_FILE,
+    TRAJECTORIES_FILE,
+    FlownEpisode,
+    RunFolder,
+    load,
+)
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup, write_demo_run
 
 
@@ -179,17 +186,86 @@ def test_kill_9_at_any_moment_loses_one_episode_at_most(tmp_path: Path) -> None:
 
 def test_archives_are_the_same_bytes_for_the_same_arrays(tmp_path: Path) -> None:
     arrays: dict[str, np.ndarray] = {"x": np.arange(5), "y": np.ones((2, 3), np.float32)}
+    groups = {"000", "001"}
     for name in ("a.npz", "b.npz"):
-        add_arrays(tmp_path / name, {"000": arrays})
-        add_arrays(tmp_path / name, {"001": arrays})
+        path = tmp_path / name
+        add_arrays(path, {"000": arrays})
+        if name == "b.npz":
+            close_archive(path, groups)  # is opened again
+        add_arrays(path, {"001": arrays})
+        close_archive(path, groups)
+        before = path.read_bytes()
+        close_archive(path, groups)
+        assert path.read_bytes() == before
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     with np.load(tmp_path / "a.npz") as archive:
         assert archive.files == ["000/x", "000/y", "001/x", "001/y"]
         assert archive["001/y"].dtype == np.float32
-    add_arrays(tmp_path / "a.npz", {"000": {"x": np.arange(2)}})
-    with np.load(tmp_path / "a.npz") as archive:
-        assert sorted(archive.files) == ["000/x", "001/x", "001/y"]
-        assert archive["000/x"].tolist() == [0, 1]
+        assert archive["001/x"].tolist() == list(range(5))
+
+
+def test_an_archive_without_its_end_is_read_and_completed(tmp_path: Path) -> None:
+    """A kill may leave any number of bytes: whole groups survive, and the next run is the same."""
+    path = tmp_path / "a.npz"
+    groups = {f"{i:03d}": {"x": np.arange(5 + i), "y": np.ones(i)} for i in range(3)}
+    ends = []
+    for name, arrays in groups.items():
+        add_arrays(path, {name: arrays})
+        ends.append(path.stat().st_size)
+    appended = path.read_bytes()
+    close_archive(path, groups)
+    whole = path.read_bytes()
+    assert whole.startswith(appended)
+    edges = [end + shift for end in ends for shift in (-1, 0, 1)]
+    for cut in sorted({*edges, *range(0, len(whole), 61)}):
+        path.write_bytes(whole[:cut])
+        kept = [name for name, end in zip(groups, ends, strict=True) if end <= cut]
+        found = read_groups(path, kept)
+        assert list(found) == kept
+        assert all(found[each].arrays["x"].size == 5 + int(each) for each in kept)
+        close_archive(path, kept)
+        with np.load(path) as archive:
+            assert archive.files == [f"{name}/{array}" for name in kept for array in "xy"]
+        for name in list(groups)[len(kept) :]:
+            add_arrays(path, {name: groups[name]})
+        close_archive(path, groups)
+        assert path.read_bytes() == whole
+
+
+def test_groups_in_the_middle_of_an_archive_are_removed(tmp_path: Path) -> None:
+    path, other = tmp_path / "a.npz", tmp_path / "b.npz"
+    for name in ("000", "001", "002"):
+        add_arrays(path, {name: {"x": np.arange(5) + int(name)}})
+        if name != "001":
+            add_arrays(other, {name: {"x": np.arange(5) + int(name)}})
+    close_archive(path, {"000", "002"})
+    close_archive(other, {"000", "002"})
+    assert path.read_bytes() == other.read_bytes()
+    with np.load(path) as archive:
+        assert archive.files == ["000/x", "002/x"]
+        assert archive["002/x"].tolist() == [2, 3, 4, 5, 6]
+
+
+def bytes_written() -> int:
+    """Return the bytes that this process has passed to write calls."""
+    fields = Path("/proc/self/io").read_text().splitlines()
+    return int(dict(field.split(": ") for field in fields)["wchar"])
+
+
+def test_saving_a_run_writes_its_archives_once(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run", "many", {}, setup=demo_setup())
+    record, trajectory, latency = demo_episode(0, demo_arena(1))
+    before = bytes_written()
+    for index in range(100):
+        folder.save_episodes([FlownEpisode(replace(record, index=index), trajectory, latency)])
+    folder.close()
+    written = bytes_written() - before
+    archives = (TRAJECTORIES_FILE, LATENCY_FILE)
+    size = sum((folder.path / name).stat().st_size for name in (*archives, EPISODES_FILE))
+    assert size <= written < 1.05 * size
+    for name in archives:
+        with np.load(folder.path / name) as archive:
+            assert len({key.partition("/")[0] for key in archive.files}) == 100
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:

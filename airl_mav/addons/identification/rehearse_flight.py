@@ -169,7 +169,7 @@ def rehearse_flight(
         episode.record, arena=scenario.arena, arena_seed=scenario.arena_seed_of(scenario.seed)
     )
     # Saved before the rehearsals: an interrupted command leaves the flight readable.
-    RunFolder.adopt(out / FLOWN, info).save_episodes([replace(episode, record=record)])
+    RunFolder.adopt(out / FLOWN, info, episodes=[replace(episode, record=record)])
     run = rehearse(scenario, out=out / REHEARSED, progress=asked.progress)
     flown = _navigated(episode.trajectory, record)
     paths = [

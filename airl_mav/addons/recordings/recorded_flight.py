@@ -235,7 +235,7 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
             )
         return folder
     episode = episode_of(box) if ulg is None else logged_episode_of(box, log)
-    run_folder.RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
+    run_folder.RunFolder.adopt(folder, info_of(box, digest), episodes=[episode])
     return folder
 
 
