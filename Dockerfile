@@ -2,14 +2,15 @@
 FROM python:3.11-slim AS build
 WORKDIR /src
 COPY . .
-RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
+RUN pip install --no-cache-dir --no-deps --require-hashes --requirement requirements/build.txt \
+    && pip wheel --no-cache-dir --no-deps --no-build-isolation --wheel-dir /wheels .
 
 FROM python:3.11-slim
 COPY --from=build /wheels /wheels
-COPY constraints.txt /tmp/constraints.txt
-# The wheel's name contains the version; a requirement with an extra needs its exact path.
-RUN pip install --no-cache-dir --constraint /tmp/constraints.txt "$(ls /wheels/*.whl)[sim]" \
-    && rm -r /wheels /tmp/constraints.txt \
+COPY requirements/sim.txt /tmp/sim.txt
+RUN pip install --no-cache-dir --no-deps --require-hashes --requirement /tmp/sim.txt \
+    && pip install --no-cache-dir --no-deps /wheels/*.whl \
+    && rm -r /wheels /tmp/sim.txt \
     && useradd --create-home --uid 1000 airl
 USER 1000
 WORKDIR /home/airl

@@ -29,22 +29,27 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## Show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
+# The versions and hashes of requirements/, which scripts/lock writes. torch alone has none: its builds
+# for machines without a GPU are on another index.
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+LOCKED := $(PIP) --no-deps --require-hashes --requirement requirements
+
 # The pip that comes with CPython 3.10 and 3.11 takes twice the time to install the same.
 define install
 	@test -n "$(INTERPRETER)" || { PYTHON='$(PYTHON)' scripts/find-python --explain; exit 1; }
 	@test -x $(BIN)/python || $(INTERPRETER) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-	    --upgrade pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	    --constraint constraints.txt --editable '.[$(1)]'
+	$(LOCKED)/build.txt
+	$(LOCKED)/$(1).txt
+	$(if $(2),$(PIP) $(shell grep '^$(2)==' constraints.txt))
+	$(PIP) --no-deps --no-build-isolation --editable .
 	@touch $@
 endef
 
-$(FLY): pyproject.toml constraints.txt scripts/find-python
+$(FLY): pyproject.toml requirements/sim.txt scripts/find-python
 	$(call install,sim)
 
-$(ALL): pyproject.toml constraints.txt scripts/find-python
-	$(call install,sim$(comma)train$(comma)dev)
+$(ALL): pyproject.toml requirements/all.txt scripts/find-python
+	$(call install,all,torch)
 	@touch $(FLY)
 
 $(RAY): $(ALL)
@@ -95,6 +100,11 @@ nightly: $(RAY)  ## All tests, with the long ones of stops and kills, and those 
 .PHONY: docs
 docs: $(ALL)  ## Build the documentation site into site/ (no network needed)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
+.PHONY: audit
+audit: $(ALL)  ## Check licences, and known vulnerabilities (needs pip-audit)
+	$(BIN)/python scripts/licences.py
+	pip-audit --requirement requirements/all.txt --no-deps --disable-pip
 
 .PHONY: release-check
 release-check:  ## Build sdist and wheel, install each in a clean environment and fly
