@@ -39,7 +39,7 @@ MODULES = {
     ),
     "paired": (
         "airl_mav/flight/statistics.py",
-        "unit/test_paired.py unit/test_flight_statistics.py",
+        "unit/test_paired.py unit/test_flight_statistics.py unit/test_statistics_edges.py",
     ),
     "injection": (
         "airl_mav/latency/injection.py",
@@ -56,8 +56,7 @@ MODULES = {
     ),
     "storage": (
         "firmware_sim/addons/ground_station_services/files.py",
-        # MAVSDK's threads do not survive the fork.
-        "firmware/test_mavlink_ftp.py -knot(mavsdk)",
+        "unit/test_ftp_storage.py",
     ),
     "cascade": (
         "airl_mav/control/cascade.py",

@@ -99,3 +99,9 @@ def test_impossible_samplers_are_refused() -> None:
         FixedSampler(-1)
     with pytest.raises(ValueError, match="no samples"):
         ReplaySampler([], np.random.default_rng(0))
+
+
+def test_no_latency_is_a_latency() -> None:
+    assert FixedSampler(0).sample_us() == 0
+    with pytest.raises(ValueError, match="latency_us=-1: must be >= 0"):
+        FixedSampler(-1)

@@ -14,6 +14,7 @@ from airl_mav.flight.requirements import (
     RequirementDecision,
     find,
     parse_requirement,
+    settle,
 )
 from airl_mav.flight.statistics import (
     NO_ESTIMATE,
@@ -163,3 +164,41 @@ def test_late_decisions_are_judged_as_a_share() -> None:
     finding = find(parse_requirement("deadline_misses <= 1 %"), quality, None)
     assert finding.decision is RequirementDecision.NOT_MET
     assert finding.sentence().endswith("(2.0 % [1.5, 3.0], n = 100)")
+
+
+def test_a_minimum_success_rate_alone_is_tested_sequentially() -> None:
+    rate = parse_requirement("success >= 80 %")
+    assert rate.least_rate
+    assert rate.test().threshold == pytest.approx(0.8)
+    for text in ("success <= 80 %", "success gap >= -1 points", "energy >= 3 kJ"):
+        assert not parse_requirement(text).least_rate
+    with pytest.raises(FieldError, match="below 100 %"):
+        parse_requirement("success >= 100 %").test()
+
+
+def test_a_sequential_finding_takes_its_decision_from_the_flights_in_order() -> None:
+    undecided = find(parse_requirement("success >= 85 %"), QUALITY, None)
+    met = settle(undecided, [True] * 100)
+    assert met.decision is RequirementDecision.MET
+    assert met.more_flights is None
+    assert met.estimate == undecided.estimate
+    assert settle(undecided, [False] * 100).decision is RequirementDecision.NOT_MET
+    early = settle(undecided, [True] * 10)
+    assert early.decision is RequirementDecision.UNDECIDED
+    needed = undecided.requirement.test().flights_needed(1.0, 10)
+    assert needed is not None
+    assert early.more_flights == needed - 10
+    assert settle(undecided, []).more_flights is None
+    other = find(parse_requirement("flight_time <= 9 s"), QUALITY, None)
+    assert settle(other, [True]) is other
+
+
+@pytest.mark.parametrize(("limit", "more"), [(7.0, 1500), (8.5, 300)])
+def test_the_flights_to_a_decision_count_the_near_half_of_an_interval(
+    limit: float, more: int
+) -> None:
+    """The half towards the limit decides: 4 s below the value, 1 s above."""
+    quality = replace(QUALITY, flight_time_s=Estimate(8.0, 4.0, 9.0, 100))
+    finding = find(Requirement("flight_time", False, "<=", limit), quality, None)
+    assert finding.decision is RequirementDecision.UNDECIDED
+    assert finding.more_flights == more
