@@ -104,6 +104,8 @@ def test_links_neither_count_nor_lead_anywhere(
 
 def test_only_growth_needs_room(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     (client.folder / "log").write_bytes(bytes(80))
+    monkeypatch.setattr(files, "GREATEST_BYTES", 80)
+    assert client.full(TRUNCATE, b"log", 81)
     monkeypatch.setattr(files, "GREATEST_BYTES", 90)
     assert client.full(TRUNCATE, b"log", 91)
     assert not client.full(TRUNCATE, b"log", 90)
@@ -174,6 +176,14 @@ def test_a_session_is_one_file(client: Client) -> None:
     client.ask(RESET)
     with pytest.raises(IsADirectoryError):
         client.ask(OPEN, b"/")
+    assert client.session.file is None
+
+
+def test_a_new_file_has_the_usual_permissions(client: Client) -> None:
+    client.ask(CREATE, b"log")
+    (client.folder / "usual").touch()
+    modes = {(client.folder / name).stat().st_mode for name in ("log", "usual")}
+    assert len(modes) == 1
 
 
 def test_a_message_holds_no_more_than_its_size(client: Client) -> None:

@@ -193,8 +193,6 @@ def _open_to_read(request: FtpRequest, session: Session, storage: Storage) -> by
     path = storage.path(request.name)
     # One session per client, as in PX4.
     _check_free(session)
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     session.file = path.open("rb")
     session.size = path.stat().st_size
     return _SIZE.pack(session.size)
