@@ -50,7 +50,7 @@ MODULES = {
         "airl_mav/core/signing.py",
         "unit/test_signing.py firmware/test_mavlink_signing.py",
     ),
-    "limits": ("companion/limits.py", "unit/test_limits.py"),
+    "limits": ("companion/limits.py", "unit/test_limits.py unit/test_limit_rules.py"),
     "files": (
         "airl_mav/core/files.py",
         "unit/test_files.py unit/test_run_folder.py unit/test_log_file.py",
