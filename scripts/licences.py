@@ -34,13 +34,11 @@ GPL_LIBRARIES = ("x264", "x265", "postproc", "rubberband", "vidstab", "xvid")
 
 def licence_of(package: Distribution) -> str:
     """Return the licence in a package's metadata; empty if there is none."""
-    data = package.metadata
-    if expression := data.get("License-Expression"):
+    data = package.metadata.json
+    if expression := data.get("license_expression"):
         return str(expression)
-    found = [
-        line.split(" :: ")[-1] for line in data.get_all("Classifier") or [] if "License ::" in line
-    ]
-    return "; ".join(found) or str(data.get("License") or "").strip().split("\n")[0]
+    found = [line.split(" :: ")[-1] for line in data.get("classifier", []) if "License ::" in line]
+    return "; ".join(found) or str(data.get("license", "")).strip().split("\n")[0]
 
 
 def problems_of(packages: Iterable[Distribution], notice: str) -> list[str]:

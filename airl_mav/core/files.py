@@ -26,9 +26,9 @@ import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
-from typing import IO, Any, NoReturn, TypeVar
+from typing import IO, Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -356,8 +356,7 @@ def deeper_than(value: object, most: int) -> bool:
 # --- arrays
 
 
-@dataclass(frozen=True)
-class ArrayGroup:
+class ArrayGroup(NamedTuple):
     """Group of arrays in an archive."""
 
     arrays: Arrays
@@ -366,7 +365,7 @@ class ArrayGroup:
 
 
 NO_ARRAYS = ArrayGroup({}, "00000000")
-"""Placeholder for a group that is missing in an archive."""
+"""Placeholder for a group missing from an archive."""
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -380,7 +379,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
     """Append groups of arrays to an .npz, created if missing; return the CRC of each group.
 
     Keys become `<group>/<name>`. Only the new arrays are written: `read_groups` needs no directory,
-    and other programs need the one of `close_archive`. Raises as `append_lines`.
+    other programs need the one of `close_archive`. Raises as `append_lines`.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
@@ -388,7 +387,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
             for name, array in arrays.items():
                 with new.open(f"{group}/{name}.npy", "w") as stream:
                     np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
-        # Without the directory, which follows at the end of the block.
+        # The end of the block adds the directory.
         entries, members = buffer.getvalue(), new.infolist()
     with naming(path), open_to_append(path) as file:
         file.seek(max(0, file.tell() - _END_SIZE))
@@ -396,14 +395,11 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
             file.seek(0)
             file.truncate(_archive(file.read()).start_dir)
         _append(file, entries)
-    return {
-        group: _group_crc([member for member in members if _group_of(member) == group])
-        for group in groups
-    }
+    return {group: _group_crc([m for m in members if _group_of(m) == group]) for group in groups}
 
 
 def close_archive(path: Path, groups: Collection[str]) -> None:
-    """Remove all but some groups, and an array cut short; write the directory. Raises as above."""
+    """Remove all but some groups, and an array cut short; write the directory."""
     with naming(path), open_to_append(path) as file:
         file.seek(0)
         data, whole = file.read(), io.BytesIO()
@@ -425,16 +421,12 @@ def read_groups(path: Path, groups: Collection[str]) -> dict[str, ArrayGroup]:
         return {}
     try:
         with _archive(path.read_bytes(), groups) as archive:
-            members: dict[str, list[zipfile.ZipInfo]] = {}
-            for member in archive.infolist():
-                members.setdefault(_group_of(member), []).append(member)
-            return {
-                group: ArrayGroup(
-                    {_array_name(each): _read_array(archive, each) for each in held},
-                    _group_crc(held),
-                )
-                for group, held in members.items()
-            }
+            found = {}
+            for group, members in groupby(archive.infolist(), _group_of):
+                held = list(members)
+                arrays = {_array_name(each): _read_array(archive, each) for each in held}
+                found[group] = ArrayGroup(arrays, _group_crc(held))
+            return found
     except Exception as error:  # Bit errors may request passwords or unknown methods.
         raise UsageError(f"{path}: damaged: {' '.join(str(error).split())[:200]}") from None
 

@@ -68,11 +68,9 @@ class EpisodeSaver:
             self._ending = True
             self._changed.notify_all()
         self._thread.join()
-        try:
-            if error is None:
-                self._raise_error()
-        finally:
-            self._folder.close()
+        self._folder.close()
+        if error is None:
+            self._raise_error()
 
     def add(self, episode: FlownEpisode) -> None:
         """Add an episode; blocks while the queue is full. Raises the error of a failed save."""

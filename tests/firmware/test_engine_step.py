@@ -57,7 +57,7 @@ def fly() -> dict[str, list[float]]:
     for name, log in zip(
         ("truth", "flown"), map(np.concatenate, zip(*logs, strict=True)), strict=True
     ):
-        for field in log.dtype.names:
+        for field in log.dtype.names or ():
             values = np.nan_to_num(log[field].reshape(len(log), -1).astype(np.float64))
             blocks = [block.mean(axis=0) for block in np.array_split(values, 8)]
             found[f"{name}.{field}"] = np.concatenate([*blocks, values[-1]]).tolist()

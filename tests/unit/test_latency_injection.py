@@ -107,8 +107,8 @@ def test_a_workload_keeps_its_source_and_what_is_assumed(own: bool) -> None:
     pi = with_policy("ab12")
     work = pi.workloads["ours"].model_copy(update={"source": "a bench", "assumed": "no heat sink"})
     pi = pi.model_copy(update={"workloads": {"ours": work}})
-    choice = {"policy_sha256": "ab12"} if own else {"workload": "ours"}
-    injection = choose_injection(pi, **choice)
+    by_name, by_digest = choose_injection(pi, "ours"), choose_injection(pi, policy_sha256="ab12")
+    injection = by_digest if own else by_name
     assert (injection.source, injection.assumed) == ("a bench", "no heat sink")
     assert injection.latency is work.latency
     assert injection.origin == "injected"

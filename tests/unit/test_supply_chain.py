@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from email.message import Message
+from collections.abc import Iterator, Sequence
 from importlib.metadata import Distribution, PackagePath, distributions
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 UNLOCKED = "torch"
 
 
-def entries(name: str) -> list[tuple[str, str, Marker | None]]:
+def entries(name: str) -> Sequence[tuple[str, str, Marker | None]]:
     """Return name, version and marker of each package of a lock."""
     text = (ROOT / "requirements" / f"{name}.txt").read_text()
     found = [
@@ -87,6 +86,17 @@ def test_actions_of_ci_are_pinned_by_commit() -> None:
     assert found >= 10
 
 
+class Metadata(dict[str, str]):
+    """Metadata of a package, by the names of its JSON form too."""
+
+    @property
+    def json(self) -> dict[str, str]:
+        return self
+
+    def __missing__(self, name: str) -> str:
+        return self[name.lower()]
+
+
 class Package(Distribution):
     """Installed package with a licence and files."""
 
@@ -95,9 +105,7 @@ class Package(Distribution):
 
     @property
     def metadata(self) -> Any:
-        data = Message()
-        data["Name"], data["License-Expression"] = "thing", self.licence
-        return data
+        return Metadata({"name": "thing", "license_expression": self.licence})
 
     @property
     def files(self) -> list[PackagePath]:
