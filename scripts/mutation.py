@@ -53,7 +53,8 @@ MODULES = {
     "limits": ("companion/limits.py", "unit/test_limits.py unit/test_limit_rules.py"),
     "files": (
         "airl_mav/core/files.py",
-        "unit/test_files.py unit/test_run_folder.py unit/test_log_file.py",
+        "unit/test_files.py unit/test_run_folder.py unit/test_log_file.py report/test_links.py "
+        "'-knot kill_9 and not a_report and not machine and not checkout and not documentation'",
     ),
     "storage": (
         "firmware_sim/addons/ground_station_services/files.py",
@@ -66,9 +67,9 @@ MODULES = {
     "engine step": ("firmware_sim/engine/ticks.py", "firmware/test_engine_step.py"),
     "conductor": (
         "airl_mav/lockstep/conductor.py",
-        # The others take longest.
-        "flight/test_lockstep_words.py flight/test_lockstep.py -k"
-        "'not gps and not filterpy and not disk and not hanging and not failsafes and not others'",
+        # The others fly.
+        "unit/test_conductor.py flight/test_lockstep.py '-kconductor or newest or repetitions or "
+        "same_setpoint or leaving or offboard_again or wall_clock or pings or requests'",
     ),
     "safe velocity": (
         "airl_mav/envs/stopping.py",

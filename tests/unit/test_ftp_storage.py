@@ -135,6 +135,21 @@ def test_a_growing_file_is_checked_once_a_chunk(
     assert client.full(WRITE, b"x" * 10, 2 * CHUNK_BYTES)
 
 
+def test_small_growth_within_a_chunk_is_not_checked(
+    client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The check scans the storage: once a chunk, not at every message."""
+    client.ask(CREATE, b"log")
+    client.ask(WRITE, b"x" * 10, CHUNK_BYTES + 10)
+    checks: list[int] = []
+    monkeypatch.setattr(Storage, "check_room", lambda self, more: checks.append(more))
+    for offset in range(20, 2000, 10):
+        client.ask(WRITE, b"x" * 10, CHUNK_BYTES + offset)
+    assert checks == []
+    client.ask(WRITE, b"x" * 10, 2 * CHUNK_BYTES)
+    assert checks == [2 * CHUNK_BYTES + 10 - (CHUNK_BYTES + 2000)]
+
+
 def test_a_listing_continues_where_it_ended(client: Client) -> None:
     names = [f"{i:03d}-{'n' * 60}" for i in range(7)]
     for name in names:

@@ -17,14 +17,16 @@ from companion.frame_source import ReceivedFrame
 from companion.limits import (
     BATTERY_LOW,
     CAMERA_WRONG,
+    CLIMB_M,
     DISARMED,
     MODE_KNOWN_S,
+    OUT_OF_TIME,
     TAKEN_OVER,
     CameraLimits,
     VehicleLimits,
     ground_in_view,
 )
-from companion.link_interface import FRAMES_LATE, VehicleStatus
+from companion.link_interface import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
 
 LENS = Intrinsics.from_fov(8, 6, math.radians(90.0))
 SETTINGS = LimitSettings(silence_s=1.0)
@@ -186,3 +188,33 @@ def test_a_charge_at_its_limit_is_enough() -> None:
         assert (found is not None) == ends
         assert found is None or found.reason == BATTERY_LOW
     assert vehicle().broken(VehicleStatus(True, True, "offboard"), state(), 0) is None
+
+
+def test_telemetry_may_be_the_same_for_a_while() -> None:
+    limits, status = vehicle(silence_s=1.0), VehicleStatus(True, True, "offboard")
+    reasons = []
+    for now_us in (0, 200_000, 400_000, 2_100_000):
+        found = limits.broken(status, state(), now_us)
+        reasons.append(found.reason if found else None)
+    assert reasons == [None, None, None, TELEMETRY_FROZEN]
+
+
+def test_the_time_of_a_flight_counts_from_its_start() -> None:
+    limits, status = vehicle(flight_s=10.0), VehicleStatus(True, True, "offboard")
+    limits.begun_us = 3_000_000
+    reasons = []
+    for t_s in np.arange(3.0, 13.9, 0.4):
+        # As from an estimator: no value stays the same.
+        still, noise = state(), 1e-6 * math.sin(t_s)
+        now = Kinematics(still.position + noise, still.velocity + noise, still.quaternion + noise)
+        found = limits.broken(status, now, round(t_s * US_PER_S))
+        reasons.append(found.reason if found else None)
+    assert reasons[:-2] == [None] * (len(reasons) - 2)
+    assert reasons[-2:] == [OUT_OF_TIME] * 2
+
+
+def test_a_low_flight_has_a_low_ceiling() -> None:
+    for altitude_m in (0.6, 2.5):
+        pilot = PilotSettings(altitude_m=altitude_m)
+        limits = VehicleLimits(LimitSettings(), (25.0, 0.0), pilot)
+        assert limits.height_m == pytest.approx(altitude_m + CLIMB_M)
