@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -217,7 +218,10 @@ def test_a_command_without_an_answer_yet_blocks_and_then_ends_the_flight() -> No
     companion = Companion(arms, arms, wakes(None))
     conductor = Conductor(vehicle, companion)
     conductor.begin(10_000)
-    ticks(conductor, 1, 5)
+    ticks(conductor, 1, 4)
+    vehicle.say(b"no answer")
+    ticks(conductor, 5, 5)
+    assert not events[0].is_set()
     assert conductor.quiet_until_us == 0.0
     assert vehicle.expected == [False] * 3 + [True] * 2
     assert vehicle.read[0][1] is False
@@ -292,3 +296,54 @@ def test_a_suspended_companion_gets_the_overdue_turn() -> None:
     conductor.resume()
     ticks(conductor, 10, 10)
     assert companion.log[1] == ("turn", 36_000), "at the start of the newest tick"
+
+
+def test_a_paced_flight_takes_its_wall_time() -> None:
+    conductor = Conductor(Vehicle(), Companion(), speed=10.0)
+    assert conductor.is_shown
+    conductor.begin(10_000_000)
+    conductor.restart(1_000_000)
+    assert conductor.clock.time_us() == 1_000_000
+    began = time.monotonic()
+    for tick in range(251, 301):
+        conductor.wait(tick * TICK_US, (), lambda _: None)
+    # 0.2 s at ten times the wall clock.
+    assert time.monotonic() - began >= 0.018
+    assert conductor.read_by(5) == 5
+
+
+def test_telemetry_is_as_old_as_the_start_of_its_tick() -> None:
+    vehicle = Vehicle()
+    conductor = Conductor(vehicle, Companion())
+    conductor.begin(10_000_000)
+    vehicle.say(b"t")
+    conductor.wait(400_000, (), lambda _: None)
+    conductor.clock.sleep_until(396_000 + SILENCE_US)
+    assert conductor.heard
+    conductor.clock.sleep_until(396_000 + SILENCE_US + 1)
+    assert not conductor.heard
+
+
+def test_checks_that_were_passed_over_are_not_made_later() -> None:
+    poll = Poll(10_000, lambda frames: True, lambda frames: math.inf)
+    companion = Companion(wakes(20_000, poll=poll), wakes(None))
+    conductor = Conductor(Vehicle(), companion)
+    conductor.begin(4_000)
+    ticks(conductor, 1, 1)
+    conductor.wait(400_000, (), lambda _: None)
+    assert companion.log == [("turn", 4_000), ("turn", 400_000)]
+
+
+def test_a_condition_that_forwarded_telemetry_meets_stays_met() -> None:
+    vehicle = Vehicle()
+    poll = Poll(10_000, lambda frames: len(frames) > 0, None)
+    companion = Companion(wakes(FEED_US + 50_000, poll=poll), wakes(None))
+    conductor = Conductor(vehicle, companion)
+    conductor.begin(4_000)
+    ticks(conductor, 1, 1)
+    first = FEED_US // TICK_US + 2
+    for tick in range(2, first + 20):
+        if tick <= first:
+            vehicle.say(b"t")
+        ticks(conductor, tick, tick)
+    assert companion.log[-1] == ("turn", FEED_US + 50_000)
