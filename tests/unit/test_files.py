@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from airl_mav.core import files
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import (
     add_arrays,
@@ -199,3 +200,44 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, job: str) -> N
     assert [each.name for each in tmp_path.iterdir()] == ["x"]
     assert path.read_bytes() == before
     assert read_groups(path, {"000"}) if job == "add" else read_lines(path, None)
+
+
+def test_a_temporary_file_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"mine")
+    monkeypatch.setattr(files.secrets, "token_hex", lambda _: "00")
+    (tmp_path / f"x.00{files.TEMPORARY_SUFFIX}").symlink_to(victim)
+    with pytest.raises(FileExistsError):
+        files.replace_file(tmp_path / "x", b"theirs")
+    assert victim.read_bytes() == b"mine"
+    assert not (tmp_path / "x").exists()
+
+
+def test_an_error_while_writing_is_raised_and_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"old")
+    with pytest.raises(ValueError, match="mine"), files.replacing(path) as partial:
+        partial.write_bytes(b"new")
+        raise ValueError("mine")
+    assert [each.name for each in tmp_path.iterdir()] == ["x"]
+    assert path.read_bytes() == b"old"
+
+
+def test_errors_without_a_name_get_one() -> None:
+    for error, name in (
+        (OSError(28, "full"), "there"),
+        (OSError(28, "full", "here"), "here"),
+        (OSError("no number"), None),
+    ):
+        with pytest.raises(OSError, match=r".") as caught, files.naming(Path("there")):
+            raise error
+        assert caught.value.filename == name
+
+
+def test_where_locks_are_unsupported_nothing_is_locked(tmp_path: Path) -> None:
+    with (tmp_path / "x").open("wb") as file:
+        assert files.try_lock(file.fileno())
+        with (tmp_path / "x").open("rb") as other:
+            assert not files.try_lock(other.fileno())
+            closed = other.fileno()
+    assert files.try_lock(closed), "any other error"
