@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from airl_mav.core import files
 from airl_mav.core.errors import UsageError
@@ -241,3 +242,10 @@ def test_where_locks_are_unsupported_nothing_is_locked(tmp_path: Path) -> None:
             assert not files.try_lock(other.fileno())
             closed = other.fileno()
     assert files.try_lock(closed), "any other error"
+
+
+def test_a_wrong_field_is_one_line_with_its_source() -> None:
+    adapter = TypeAdapter(dict[str, int])
+    assert files.typed(adapter, {"a": 1}, "x.json") == {"a": 1}
+    with pytest.raises(UsageError, match=r"^x\.json: "):
+        files.typed(adapter, {"a": "b"}, "x.json")
