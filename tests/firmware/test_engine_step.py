@@ -21,6 +21,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.engine import ticks
 from firmware_sim.plant import plant
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
@@ -41,7 +42,7 @@ def fly(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[float]]:
         ended.append(plant_ticks(*arguments))
         return int(ended[-1])
 
-    plant_ticks = plant.stretch
+    plant_ticks = ticks.stretch
     monkeypatch.setattr(plant, "stretch", noted)
     vehicle = load_vehicle("quad")
     spec = load_profile("arenas", "crowded", ArenaSpec)

@@ -206,7 +206,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, job: str) -> N
 def test_a_temporary_file_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     victim = tmp_path / "victim"
     victim.write_bytes(b"mine")
-    monkeypatch.setattr(files.secrets, "token_hex", lambda _: "00")
+    monkeypatch.setattr("secrets.token_hex", lambda _: "00")
     (tmp_path / f"x.00{files.TEMPORARY_SUFFIX}").symlink_to(victim)
     with pytest.raises(FileExistsError):
         files.replace_file(tmp_path / "x", b"theirs")
