@@ -19,7 +19,7 @@ model = PPO("MultiInputPolicy", env, n_steps=64, seed=1)
 model.learn(STEPS)
 model.save("model.zip")
 
-request = ExportRequest(model="model.zip", algorithm="PPO", out=Path("my-policy"))
+request = ExportRequest(model="model.zip", trust=True, algorithm="PPO", out=Path("my-policy"))
 card = export(request, command="python examples/sb3_model.py")
 print(f"my-policy: {card.parameters:,} parameters, {card.actions.set}")
 

@@ -28,11 +28,11 @@ class ExportOptions(ExportRequest):
     `goal`, as set by `--layout`, `--image` and `--kind`, and return the actions of `--actions`. A
     custom module may take the three as arguments. A .zip does not contain the statistics of a
     VecNormalize wrapper. Pass its file with --vec-normalize, or the exported policy gets wrong
-    inputs. Both files contain pickled Python objects, and a module is code: export only files from
-    people that you trust.
+    inputs. Both files contain pickled Python objects, which can run any code: they require
+    --trust. A module is code, too.
 
     Examples:
-        airl export model.zip --algorithm PPO --out policies/mine
+        airl export model.zip --trust --algorithm PPO --out policies/mine
         airl export mypackage.nets:make_net --weights net.pt --like my.toml --out policies/mine
         airl export static-obstacles --int8 --out policies/static-obstacles-int8
         airl export crowded --decisions pipelined --out policies/crowded-pipelined
@@ -93,17 +93,20 @@ def _export(options: ExportOptions) -> PolicyCard:
 def _copy(options: ExportOptions) -> PolicyCard:
     given = options.model_dump(exclude_defaults=True)
     changes = {name: given[name] for name in CHANGED if name in given}
-    if other := sorted(given.keys() - {"model", "out", "name", *CHANGED}):
+    if other := sorted(given.keys() - {"model", "out", "name", "trust", *CHANGED}):
         accepted = ", ".join(CHANGED)
         raise FieldError(other[0], given[other[0]], f"of a policy that is there: {accepted}")
     return card_writing.copy_policy(
-        _policy_folder(options), options.out, changes | {"name": options.policy_name}
+        _policy_folder(options),
+        options.out,
+        changes | {"name": options.policy_name},
+        trust=options.trust,
     )
 
 
 def _policy_folder(options: ExportOptions) -> Path:
     """Return the folder of the learned policy given as the model. Raises UsageError."""
-    found = registry.find_policy(options.model)
+    found = registry.find_policy(options.model, trust=options.trust)
     if found.folder is None:
         raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
     return found.folder

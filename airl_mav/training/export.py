@@ -197,9 +197,9 @@ def check_spaces(
 def export(asked: export_request.ExportRequest, command: str) -> card.PolicyCard:
     """Export the .zip of an SB3 model, or a torch module, as a policy; return its card.
 
-    A .zip contains pickled Python objects and a module is code. Export only from trusted sources.
-    Raises UsageError if the model cannot be loaded or exported or does not fit its description, or
-    the folder is not writable. In this case no usable policy is written.
+    A .zip contains pickled Python objects: it requires `trust`. Raises UsageError if the model is
+    not trusted, cannot be loaded or exported or does not fit its description, or the folder is not
+    writable. In this case no usable policy is written.
     """
     out = asked.out
     if out.exists() and not out.is_dir():
@@ -210,6 +210,7 @@ def export(asked: export_request.ExportRequest, command: str) -> card.PolicyCard
         module = load_module(asked.model, asked.weights, tuple(layouts.boxes(facts.observation)))
         write = partial(onnx_export.export_network, module, folder=out, with_torch=asked.with_torch)
     else:
+        asked.check_trust()
         learner = load_sb3(Path(asked.model), asked.algorithm or "")
         facts = asked.facts(command, taken_by(learner))
         path = asked.vec_normalize

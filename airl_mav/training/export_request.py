@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import COMMON, optional, switch, validated
 from airl_mav.core.machine import package_versions
 from airl_mav.core.plugins import names_code
@@ -221,6 +221,10 @@ class ExportRequest(BaseModel):
         description="share of random actions in flight, 0 to 1; discrete action sets only",
     )
     with_torch: bool = switch("also write policy.pt2, for the torch runtime")
+    trust: Annotated[bool, COMMON] = switch(
+        "unpickle a .zip and its VecNormalize, or run code that a policy's card names: all execute"
+        " what their author wrote"
+    )
     int8: Annotated[bool, COMMON] = switch(
         "write a network in 8-bit integers, calibrated with frames of its own flights"
     )
@@ -235,6 +239,14 @@ class ExportRequest(BaseModel):
         """True for a custom module."""
         return names_code(self.model)
 
+    def check_trust(self) -> None:
+        """Raise UsageError for a model of pickled objects, unless its author is trusted."""
+        if not (self.own_module or self.trust):
+            raise UsageError(
+                f"{self.model}: unpickling it can run any code on this machine; accepted: with"
+                " --trust, if you trust its maker"
+            )
+
     def facts(self, command: str, taken: ModelProperties | None = None) -> PolicyFacts:
         """Return the card data, `taken` from the loaded model; UsageError for a wrong field."""
         if self.algorithm is None and not self.own_module:
@@ -243,6 +255,7 @@ class ExportRequest(BaseModel):
             raise FieldError("weights", self.weights, "with a module of your own")
         if self.vec_normalize is not None and self.own_module:
             raise FieldError("vec_normalize", self.vec_normalize, "with a .zip")
+        self.check_trust()
         known: dict[str, Any] = {
             **DEFAULTS,
             **{k: v for k, v in (taken._asdict() if taken else {}).items() if v},

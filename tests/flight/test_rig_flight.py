@@ -211,7 +211,7 @@ def test_a_model_of_stable_baselines3_flies(tmp_path: Path) -> None:
     model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, seed=1)
     model.learn(16)
     model.save(tmp_path / "ppo.zip")
-    words = ["export", str(tmp_path / "ppo.zip"), "--algorithm", "PPO", "--out"]
+    words = ["export", str(tmp_path / "ppo.zip"), "--trust", "--algorithm", "PPO", "--out"]
     with pytest.raises(UsageError, match=r"grey_down uint8 .* is told by --like CONFIG"):
         airl(*words, str(tmp_path / "no"), "--image", "64x48")
     code, text = airl(*words, str(tmp_path / "two"), "--like", str(tmp_path / "two.toml"))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
 import pickle
 import re
 import sys
@@ -414,7 +416,7 @@ def test_a_foreign_zip_exports_with_one_command(
     out = tmp_path / "mine"
     code = airl(
         monkeypatch,
-        *("export", zips / "dqn.zip", "--algorithm", "dqn", "--out", out),
+        *("export", "--trust", zips / "dqn.zip", "--algorithm", "dqn", "--out", out),
         *(
             "--image",
             "32x24",
@@ -460,7 +462,10 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
     zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("--algorithm", "SAC", "--actions", "velocity", "--with-torch")
-    assert airl(monkeypatch, "export", zips / "sac.zip", "--out", tmp_path / "v", *words) == 0
+    assert (
+        airl(monkeypatch, "export", "--trust", zips / "sac.zip", "--out", tmp_path / "v", *words)
+        == 0
+    )
     assert (tmp_path / "v" / "policy.pt2").is_file()
     assert load_learned(tmp_path / "v", runtime="torch", trust=True).act_batch(noise(4)).shape == (
         4,
@@ -472,7 +477,16 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
     make_model("PPO", spec=paper).save(tmp_path / "paper.zip")
     layout = ("--algorithm", "PPO", "--layout", "paper", "--image", "32x34")
     assert (
-        airl(monkeypatch, "export", tmp_path / "paper.zip", "--out", tmp_path / "p", *layout) == 0
+        airl(
+            monkeypatch,
+            "export",
+            "--trust",
+            tmp_path / "paper.zip",
+            "--out",
+            tmp_path / "p",
+            *layout,
+        )
+        == 0
     )
     assert load_card(tmp_path / "p").observation == paper
 
@@ -498,7 +512,15 @@ def test_what_a_vec_normalize_did_becomes_part_of_the_network(
     options: dict[str, Any] = {"n_steps": 8} if algorithm == "RecurrentPPO" else {}
     model = make_model(algorithm, **options)
     model.save(tmp_path / "model.zip")
-    words = ("export", tmp_path / "model.zip", "--algorithm", algorithm, "--out", tmp_path / "p")
+    words = (
+        "export",
+        "--trust",
+        tmp_path / "model.zip",
+        "--algorithm",
+        algorithm,
+        "--out",
+        tmp_path / "p",
+    )
     given = ("--vec-normalize", tmp_path / "vecnormalize.pkl")
     assert airl(monkeypatch, *words, *given) == 0
     seen = noise(100)
@@ -516,7 +538,7 @@ def test_a_vec_normalize_of_rewards_alone_changes_nothing(
 ) -> None:
     normalised([], norm_obs=False).save(str(tmp_path / "vecnormalize.pkl"))
     make_model("DQN").save(tmp_path / "model.zip")
-    words = ("export", tmp_path / "model.zip", "--algorithm", "DQN", "--out")
+    words = ("export", "--trust", tmp_path / "model.zip", "--algorithm", "DQN", "--out")
     given = ("--vec-normalize", tmp_path / "vecnormalize.pkl")
     assert airl(monkeypatch, *words, tmp_path / "with", *given) == 0
     assert airl(monkeypatch, *words, tmp_path / "without") == 0
@@ -546,10 +568,43 @@ def test_what_is_no_vec_normalize_is_refused_in_one_line(
     (tmp_path / "other.pkl").write_bytes(pickle.dumps([1, 2]))
     monkeypatch.chdir(tmp_path)
     words = ("--algorithm", "DQN") if model == "model.zip" else ()
-    assert airl(monkeypatch, "export", model, "--vec-normalize", file, "--out", "p", *words) == 2
+    assert (
+        airl(monkeypatch, "export", "--trust", model, "--vec-normalize", file, "--out", "p", *words)
+        == 2
+    )
     (told,) = capsys.readouterr().err.splitlines()
     assert line in told
     assert not (tmp_path / "p").exists()
+
+
+class Canary:
+    """An object whose pickle creates a folder."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, ("canary",)
+
+
+@pytest.mark.parametrize("part", ["model.zip", "statistics.pkl"])
+def test_nothing_is_unpickled_without_trust(
+    part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pickled = pickle.dumps(Canary())
+    words = ["export", "model.zip", "--algorithm", "DQN", "--out", "p"]
+    if part == "model.zip":
+        with zipfile.ZipFile("model.zip", "w") as archive:
+            held = {":type:": "a", ":serialized:": base64.b64encode(pickled).decode()}
+            archive.writestr("data", json.dumps({"policy_class": held}))
+    else:
+        make_model("DQN").save("model.zip")
+        Path(part).write_bytes(pickled)
+        words += ["--vec-normalize", part]
+    assert airl(monkeypatch, *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "model.zip: unpickling it can run any code on this machine; accepted: with" in line
+    assert not Path("canary").exists()
+    assert airl(monkeypatch, *words, "--trust") == 2
+    assert Path("canary").exists()  # The file is one that runs code.
 
 
 TOLD = """
@@ -567,7 +622,15 @@ def test_what_a_network_is_told_is_told_by_a_configuration(
     told = ObservationSpec.model_validate(SPEC.model_dump() | {"in_flight": ("command", "latency")})
     make_model("PPO", spec=told).save(tmp_path / "model.zip")
     (tmp_path / "told.toml").write_text(TOLD)
-    words = ("export", tmp_path / "model.zip", "--algorithm", "PPO", "--out", tmp_path / "p")
+    words = (
+        "export",
+        "--trust",
+        tmp_path / "model.zip",
+        "--algorithm",
+        "PPO",
+        "--out",
+        tmp_path / "p",
+    )
     assert airl(monkeypatch, *words) == 2
     line = capsys.readouterr().err
     assert "What in_flight tells is told by --like CONFIGURATION" in line
@@ -578,7 +641,7 @@ def test_what_a_network_is_told_is_told_by_a_configuration(
 def test_a_zip_says_its_image_and_kind_of_actions_itself(
     zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("export", zips / "sac.zip", "--algorithm", "SAC", "--out", tmp_path / "p")
+    words = ("export", "--trust", zips / "sac.zip", "--algorithm", "SAC", "--out", tmp_path / "p")
     assert airl(monkeypatch, *words) == 0
     card = read_card(tmp_path / "p")
     assert (card.observation.width_px, card.observation.height_px) == (32, 24)
@@ -776,7 +839,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
     out = tmp_path / "out"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        code = airl(monkeypatch, "export", zips / model, "--out", out, *options)
+        code = airl(monkeypatch, "export", "--trust", zips / model, "--out", out, *options)
     printed = capsys.readouterr()
     assert code == 2
     assert printed.out == ""
@@ -792,7 +855,9 @@ def test_out_that_is_a_file_is_refused(
 ) -> None:
     out = tmp_path / "out"
     out.write_text("mine")
-    code = airl(monkeypatch, "export", zips / "dqn.zip", "--algorithm", "DQN", "--out", out)
+    code = airl(
+        monkeypatch, "export", "--trust", zips / "dqn.zip", "--algorithm", "DQN", "--out", out
+    )
     assert code == 2
     assert f"{out}: not a folder" in capsys.readouterr().err
     assert out.read_text() == "mine"
