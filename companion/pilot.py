@@ -388,7 +388,7 @@ def fly_mission(
         reason = str(error)
     except Exception as error:
         # A policy may raise any exception; the vehicle must still land.
-        reason = f"policy failed: {type(error).__name__}: {error}"
+        reason = actions.failure_of(error)
         traceback.print_exc(file=sys.stderr)
     finally:
         guard.stop()

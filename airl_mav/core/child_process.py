@@ -8,7 +8,9 @@ airl_mav.core.child_process PROGRAM ARGUMENT...`.
 
 from __future__ import annotations
 
+import importlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -187,14 +189,74 @@ class ChildProcess:
         self.resume()
 
 
+# --- functions with limits
+
+LIMITED = "--limited"
+"""First argument of a process that runs a function with limits."""
+
+
+def run_limited(function: str, data: bytes, memory_bytes: int, timeout_s: float) -> str:
+    """Run a function MODULE:NAME of bytes in a child with limits; return its result, a string.
+
+    Use it for foreign data that may take all memory, never end, or crash the process. The child
+    cannot write files. `memory_bytes` limits its address space, `timeout_s` its wall time.
+
+    Raises:
+        ValueError: The child exceeded a limit or crashed.
+    """
+    process = subprocess.Popen(  # noqa: S603 - a list of arguments, no shell
+        [sys.executable, "-m", __name__, LIMITED, function, f"{memory_bytes}", f"{timeout_s}"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=os.sep,  # -m imports from the current folder, which may be foreign.
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "OPENBLAS_NUM_THREADS": "1",  # Each thread reserves memory.
+        },
+    )
+    with process:
+        try:
+            result = process.communicate(data, timeout_s)[0]
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"takes more than {timeout_s:g} s") from None
+        finally:
+            process.kill()
+    if process.returncode:
+        raise ValueError(
+            f"ended by {Exited(process.returncode)} with {memory_bytes / 2**20:,.0f} MiB of memory"
+        )
+    return result.decode(errors="replace")
+
+
+def _run_limited(function: str, memory_bytes: int, timeout_s: float) -> None:
+    """Run the function of `run_limited` in this process, and write its result."""
+    for kind, most in (
+        (resource.RLIMIT_AS, memory_bytes),
+        (resource.RLIMIT_CPU, int(timeout_s) + 5),  # If the parent is killed meanwhile.
+        (resource.RLIMIT_FSIZE, 0),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        resource.setrlimit(kind, (most, most))
+    module, _, name = function.partition(":")
+    result = getattr(importlib.import_module(module), name)(sys.stdin.buffer.read())
+    sys.stdout.write(result)
+
+
 # --- the parent-death guard
 
 
 def main() -> None:
     """Run the command line's program until it or standard input ends; exit with its status.
 
-    With `RESUME` and a process id, resume that process when standard input ends.
+    With `RESUME` and a process id, resume that process when standard input ends. For `LIMITED` see
+    `run_limited`.
     """
+    if sys.argv[1] == LIMITED:
+        _run_limited(sys.argv[2], int(sys.argv[3]), float(sys.argv[4]))
+        return
     if sys.argv[1] == RESUME:
         _read_to_end()
         _resume(int(sys.argv[2]))

@@ -153,6 +153,25 @@ def try_lock(descriptor: int) -> bool:
     return True
 
 
+def read_file(path: Path, most_bytes: int) -> bytes:
+    """Return the content of a foreign file; reads regular files alone, up to a size.
+
+    Raises UsageError for a larger file, a pipe or device, or a system error.
+    """
+    with usage_errors(path), open(path, "rb", opener=_without_waiting) as file:
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            data = file.read(most_bytes + 1)
+            if len(data) <= most_bytes:
+                return data
+            raise UsageError(f"{path}: accepted: up to {most_bytes:,} bytes")
+    raise UsageError(f"{path}: accepted: a regular file")
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file; a pipe does not wait for its writer."""
+    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)
+
+
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal. Raises OSError."""
     with path.open("rb") as file:

@@ -8,7 +8,8 @@ use the same report.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -22,7 +23,7 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
-from airl_mav.policy.actions import Action, Policy, command_numbers, commands, flyable
+from airl_mav.policy.actions import Action, Policy, command_numbers, commands, failure_of, flyable
 from airl_mav.policy.layouts import Encoded, encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.registry import LearnedPolicy
@@ -38,6 +39,7 @@ OUTCOMES = {
     FlightStatus.COLLISION: Outcome.COLLISION,
     FlightStatus.BATTERY: Outcome.BATTERY,
     FlightStatus.TIMEOUT: Outcome.TIMEOUT,
+    FlightStatus.ABORTED: Outcome.ABORTED,
 }
 """Recorded outcome of each verdict of the vectorized simulator."""
 
@@ -52,10 +54,16 @@ class EpisodeResult:
     distance_m: float
     energy_j: float
     decisions: int
+    failure: str = ""
+    """Reason of an aborted flight: the policy's error."""
 
 
 class Pilots(Protocol):
     """Interface of pilots: decide for n vehicles, independently of each other."""
+
+    @property
+    def failed(self) -> Mapping[int, str]:
+        """Failures of the last `decide` by slot: these flights are aborted."""
 
     def begin(self, slot: int, seed: int) -> None:
         """Start an episode in a slot."""
@@ -80,6 +88,7 @@ class LearnedPilots:
         # companion's, which a batch of n rows does not guarantee.
         self._alone = bool(policy.card.epsilon or policy.card.state)
         self._own: dict[int, LearnedPolicy] = {}
+        self.failed: dict[int, str] = {}
 
     def begin(self, slot: int, seed: int) -> None:
         """Start an episode with a new random generator and empty memory."""
@@ -87,24 +96,41 @@ class LearnedPilots:
             self._own[slot] = self._policy.with_generator(self._chance(seed))
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the commands; see `Pilots`.
-
-        Raises:
-            UsageError: The network's output contains NaN.
-        """
+        """Return the commands; see `Pilots`."""
         card = self._policy.card
         encoded = encode_layout(card.observation, seen)
-        try:
-            if not self._alone:
+        self.failed = {}
+        if not self._alone:
+            with suppress(Exception):  # Of some rows, which are found below.
                 return commands(card.actions, self._policy.act_batch(encoded))
-            chosen = np.zeros((len(flying), command_numbers(card.actions)))
-            for i in np.flatnonzero(flying):
-                # One row at a time, so that a row's result does not depend on the others.
+
+        def act(i: int) -> Any:
+            # One row at a time, so that a row's result does not depend on the others.
+            if self._alone:
                 row = {key: array[i : i + 1] for key, array in encoded.items()}
-                chosen[i] = commands(card.actions, self._own[int(i)].act_batch(row))[0]
-        except ValueError as error:
-            raise errors.UsageError(f"policy {card.name}: {error}") from None
+                return commands(card.actions, self._own[i].act_batch(row))[0]
+            # In a batch of the same size: another size may give other bits.
+            same = {key: np.repeat(a[i : i + 1], len(a), 0) for key, a in encoded.items()}
+            return commands(card.actions, self._policy.act_batch(same))[i]
+
+        chosen = np.zeros((len(flying), command_numbers(card.actions)))
+        self.failed = _each(flying, act, chosen)
         return chosen
+
+
+def _each(
+    flying: NDArray[np.bool_], act: Callable[[int], Any], chosen: NDArray[np.float64]
+) -> dict[int, str]:
+    """Store the command of each flying vehicle; return the reasons of those whose policy failed."""
+    failed = {}
+    for i in np.flatnonzero(flying).tolist():
+        try:
+            chosen[i] = act(i)
+        except errors.UsageError:
+            raise
+        except Exception as error:  # A policy may raise any exception.
+            failed[i] = failure_of(error)
+    return failed
 
 
 class SinglePilots:
@@ -121,6 +147,7 @@ class SinglePilots:
         self._max_speed_m_s = max_speed_m_s
         self._commands: constants.CommandKind = commands
         self._policies: dict[int, Policy] = {}
+        self.failed: dict[int, str] = {}
 
     def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
         """Create the episode's policy."""
@@ -130,15 +157,16 @@ class SinglePilots:
         """Return the commands; see `Pilots`."""
         # NaN in the last column is altitude hold.
         chosen = np.tile((0.0, 0.0, 0.0, math.nan), (len(flying), 1))
-        for i in np.flatnonzero(flying):
-            asked = self._policies[int(i)].act(seen.rows(int(i)))
+
+        def act(i: int) -> tuple[float, ...]:
+            asked = self._policies[i].act(seen.rows(i))
             action = flyable(asked, self._commands, self._max_speed_m_s)
             if not isinstance(action, Action):
-                chosen[i] = action
-                continue
-            chosen[i, :3] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
-            if action.down_m_s is not None:
-                chosen[i, 3] = action.down_m_s
+                return action
+            down = math.nan if action.down_m_s is None else action.down_m_s
+            return action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s, down
+
+        self.failed = _each(flying, act, chosen)
         # Without any vertical speed the commands have three columns.
         return chosen[:, :3] if np.isnan(chosen[:, 3]).all() else chosen
 
@@ -152,6 +180,7 @@ class _EncodedPilots:
         self._navigation = navigation
         self._decide = decide
         self._began = began
+        self.failed: dict[int, str] = {}
 
     def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
         """Call the `began` callback, if any."""
@@ -228,7 +257,9 @@ def fly_seeds(
 
     begin(range(n))
     while busy.any() and not stop():
-        navigation.fly(pilots.decide(navigation.see(), busy))
+        decided = pilots.decide(navigation.see(), busy)
+        navigation.fleet.verdict[list(failed := pilots.failed)] = FlightStatus.ABORTED
+        navigation.fly(decided)
         decisions += 1
         now = navigation.flights()
         ended = np.flatnonzero(busy & (now.verdict != FlightStatus.FLYING)).tolist()
@@ -243,6 +274,7 @@ def fly_seeds(
                     distance_m=float(now.distance_m[i]),
                     energy_j=float(now.energy_j[i]),
                     decisions=int(decisions[i]),
+                    failure=failed.get(i, ""),
                 ),
             )
         # Slots restart only after all results of this decision have been consumed.

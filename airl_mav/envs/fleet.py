@@ -41,6 +41,7 @@ class FlightStatus(IntEnum):
     COLLISION = 2
     BATTERY = 3
     TIMEOUT = 4
+    ABORTED = 5
 
 
 class Rules(NamedTuple):

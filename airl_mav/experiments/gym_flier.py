@@ -171,7 +171,7 @@ class GymFlier:
             arena_seed=self.scenario.scenario.arena_seed_of(flown.seed),
             zone=self.scenario.scenario.zone,
             outcome=outcome,
-            reason=_reason(outcome, flights, slot, arena, rules.time_limit_s),
+            reason=flown.failure or _reason(outcome, flights, slot, arena, rules.time_limit_s),
             goal=arena.goal_point,
             goal_radius_m=rules.goal_radius_m,
             time_limit_s=rules.time_limit_s,

@@ -230,6 +230,11 @@ class RigBound(CameraBound, Protocol):
         """Return why additional cameras, by name, cannot serve the policy, or None."""
 
 
+def failure_of(error: Exception) -> str:
+    """Return the reason of a flight whose policy raised an error, in one line."""
+    return " ".join(f"policy failed: {type(error).__name__}: {error}".split())
+
+
 def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction:
     """Return an action within limits: a limited speed, or a thrust within 0..1.
 

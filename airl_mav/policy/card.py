@@ -13,7 +13,10 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
+import threading
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,10 +25,12 @@ from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.child_process import run_limited
+from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import Level
-from airl_mav.core.errors import UsageError, usage_errors
+from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
-from airl_mav.core.files import read_json
+from airl_mav.core.files import read_file, read_json
 from airl_mav.policy.actions import (
     ACTION_SETS,
     ActionSpec,
@@ -36,6 +41,7 @@ from airl_mav.policy.actions import (
 from airl_mav.policy.layouts import LAYOUTS, boxes, layout_of
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch, further_mismatch
 from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.loading import profiles_dir
 
 SCHEMA = 1
 """Version of the card's fields."""
@@ -252,13 +258,23 @@ def check_trust(folder: Path, card: PolicyCard, *, trust: bool) -> None:
 def open_model(
     folder: Path, card: PolicyCard, threads: int = 1, *, trust: bool = False
 ) -> OnnxRuntime:
-    """Return the policy of a card, ready for inference. Raises UsageError as `load_card`."""
+    """Return the policy of a card, ready for inference. Raises UsageError as `load_card`.
+
+    The model of a foreign folder runs in a child process with limits first.
+    """
     check_trust(folder, card, trust=trust)
     model = read_model(folder, card)
     try:
+        if not is_shipped(folder):
+            _try_limited(model, card)
         return OnnxRuntime(model, card.observation, card.actions, threads, card.state)
     except ValueError as error:
         raise UsageError(f"{folder / ONNX_FILE}: {error}") from None
+
+
+def is_shipped(folder: Path) -> bool:
+    """Return True for a policy of this package."""
+    return folder.resolve().is_relative_to((profiles_dir() / "policies").resolve())
 
 
 def vehicle_mismatch(
@@ -290,14 +306,16 @@ def vehicle_mismatch(
 
 def _read_bound(path: Path, sha256: str) -> bytes:
     """Return a file's bytes if they match the digest. Raises UsageError."""
-    with usage_errors(path):
-        data = path.read_bytes()
+    data = read_file(path, MODEL_BYTES)
     if (found := digest(data)) != sha256:
         raise UsageError(
             f"{path}: SHA-256 {found[:12]}...; accepted: {sha256[:12]}..., that of {CARD_FILE}"
         )
     return data
 
+
+MODEL_BYTES = 256 << 20
+"""Maximum size of a network's file."""
 
 RuntimeName = Literal["onnx", "torch"]
 
@@ -313,8 +331,8 @@ Shapes = Mapping[str, tuple[int, ...]]
 Memory = dict[str, NDArray[np.float32]]
 """Memory of n flights: arrays of n rows by name."""
 
-_ERRORS_ONLY = 3
-"""ONNX Runtime's log severity "error": hides warnings about the machine."""
+_FATAL_ONLY = 4
+"""ONNX Runtime's log severity "fatal": errors are exceptions."""
 
 _ONNX_TYPES: dict[type[np.generic], str] = {
     np.uint8: "tensor(uint8)",
@@ -363,32 +381,39 @@ class OnnxRuntime(Runtime):
         decisions; None = no memory. Raises ValueError if it is not ONNX, or inputs or outputs
         differ.
         """
-        import onnxruntime
-
-        onnxruntime.set_default_logger_severity(_ERRORS_ONLY)
-        onnxruntime.disable_telemetry_events()
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = _ERRORS_ONLY
-        # A spinning thread must not take a core from telemetry.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        try:
-            self._session = onnxruntime.InferenceSession(
-                model, options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # ONNX Runtime's errors share no other base class.
-            raise ValueError(f"not a model that ONNX Runtime loads: {first_line(error)}") from None
+        self._session = _open_session(model, threads)
         self._state = tuple(state or {})
-        _check_signature(self._session, observation, actions, state or {})
+        self._names = [ACTION, *(f"{NEXT}{name}" for name in self._state)]
+        _check_signature(self._session, *_signatures(observation, actions, state or {}))
 
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
-        """Return the outputs and the next memory; see `Runtime`."""
-        names = [ACTION, *(f"{NEXT}{name}" for name in self._state)]
-        found, *after = self._session.run(names, {**encoded, **memory})
+        """Return the outputs and the next memory; see `Runtime`.
+
+        Raises TimeoutError after `INFERENCE_S` per row.
+        """
+        inputs = {**encoded, **memory}
+        found, *after = _run(self._session, self._names, inputs)
         return found, dict(zip(self._state, after, strict=True))
+
+
+def _open_session(model: bytes, threads: int) -> Any:
+    """Return a session for the bytes of an .onnx file. Raises ValueError if it is not ONNX."""
+    import onnxruntime
+
+    onnxruntime.set_default_logger_severity(_FATAL_ONLY)
+    onnxruntime.disable_telemetry_events()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.log_severity_level = _FATAL_ONLY
+    # A spinning thread must not take a core from telemetry.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime's errors share no other base class.
+        raise ValueError(f"not a model that ONNX Runtime loads: {first_line(error)}") from None
 
 
 class TorchRuntime(Runtime):
@@ -433,28 +458,132 @@ class TorchRuntime(Runtime):
         return [self._torch.from_numpy(np.ascontiguousarray(arrays[key])) for key in keys]
 
 
-def _check_signature(
-    session: Any, observation: ObservationSpec, actions: ActionSpec, state: Shapes
-) -> None:
-    """Raise ValueError if a session's inputs or outputs differ from its card."""
+INFERENCE_S = 10.0
+"""Maximum duration of an inference, for each row of its inputs [wall s]."""
+
+_running: dict[int, list[Any]] = {}
+"""Inferences in progress by the id of their options: ONNX Runtime's options, remaining time [s]."""
+
+
+def _run(session: Any, names: list[str], inputs: Mapping[str, NDArray[Any]]) -> list[Any]:
+    """Return the outputs of a session. Raises TimeoutError for an inference that does not end."""
+    import onnxruntime
+
+    _terminator()
+    options = onnxruntime.RunOptions()
+    _running[id(options)] = [options, INFERENCE_S * len(next(iter(inputs.values())))]
+    try:
+        outputs: list[Any] = session.run(names, inputs, options)
+    except Exception:
+        if options.terminate:
+            raise TimeoutError(f"no output in {INFERENCE_S:g} s per observation") from None
+        raise
+    finally:
+        del _running[id(options)]
+    return outputs
+
+
+@cache
+def _terminator() -> None:
+    """Start the thread that terminates inferences after their time."""
+
+    def watch() -> None:
+        never = threading.Event()
+        while not never.wait(1.0):
+            for each in list(_running.values()):
+                each[1] -= 1.0
+                each[0].terminate = each[1] < 0.0
+
+    threading.Thread(target=watch, name="inference limit", daemon=True).start()
+
+
+# --- trials of foreign models
+
+Signature = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Arrays by name: ONNX type, and shape without the leading axis."""
+
+TRIAL_BYTES = 1 << 30
+"""Maximum address space of a trial; a process with ONNX Runtime takes 150 MB."""
+
+TRIAL_BYTES_OF_MODEL = 6
+"""Additional address space of a trial per byte of the model: its copies."""
+
+TRIAL_S = 20.0
+"""Timeout of a trial, with the start of the child [wall s]."""
+
+
+def _try_limited(model: bytes, card: PolicyCard) -> None:
+    """Raise ValueError for a model that fails in a child process with limits.
+
+    Passed trials are recorded, and not repeated.
+    """
+    arrays = json.dumps(_signatures(card.observation, card.actions, card.state)).encode()
+    folder = writable_folder("trials")
+    record = None if folder is None else folder / digest(card.sha256.encode() + arrays)
+    if record is not None and record.exists():
+        return
+    memory = TRIAL_BYTES + TRIAL_BYTES_OF_MODEL * len(model)
+    try:
+        found = run_limited(f"{__name__}:try_model", b"%b\n%b" % (arrays, model), memory, TRIAL_S)
+    except ValueError as error:
+        found = f"its inference {error}"
+    if found:
+        raise ValueError(found)
+    if record is not None:
+        record.touch()
+
+
+def try_model(data: bytes) -> str:
+    """Return why a model fails on two observations, all zeros and all ones; "" if it does not.
+
+    `data` are the signatures of inputs and outputs in a line of JSON, and the bytes of the model.
+    """
+    arrays, _, model = data.partition(b"\n")
+    takes, gives = json.loads(arrays)
+    types = {name: dtype for dtype, name in _ONNX_TYPES.items()}
+    try:
+        session = _open_session(model, 1)
+        _check_signature(session, takes, gives)
+        inputs = {
+            name: np.stack([make(shape, types[kind]) for make in (np.zeros, np.ones)])
+            for name, (kind, shape) in takes.items()
+        }
+        outputs = _run(session, list(gives), inputs)
+    except ValueError as error:
+        return str(error)
+    except Exception as error:
+        return f"its inference fails: {type(error).__name__}: {first_line(error)}"
+    for (name, (_, shape)), output in zip(gives.items(), outputs, strict=True):
+        if output.shape != (2, *shape):
+            return f"output {name} {output.shape}; accepted: {(2, *shape)}"
+    return "its output is not a number" if np.isnan(outputs[0]).any(axis=1).all() else ""
+
+
+def _check_signature(session: Any, takes: Signature, gives: Signature) -> None:
+    """Raise ValueError if a session's inputs or outputs differ from the signatures of its card."""
+    _compare("inputs", session.get_inputs(), takes)
+    _compare("outputs", session.get_outputs(), gives)
+
+
+def _signatures(
+    observation: ObservationSpec, actions: ActionSpec, state: Shapes
+) -> tuple[Signature, Signature]:
+    """Return the signatures of a network's inputs and outputs."""
     takes = {name: (_ONNX_TYPES[box.dtype], box.shape) for name, box in boxes(observation).items()}
     gives: dict[str, tuple[str, tuple[int, ...]]] = {
         ACTION: (_ONNX_TYPES[np.float32], (outputs_of(actions),))
     }
     for name, shape in state.items():
         takes[name] = gives[f"{NEXT}{name}"] = _ONNX_TYPES[np.float32], shape
-    _compare("inputs", session.get_inputs(), takes)
-    _compare("outputs", session.get_outputs(), gives)
+    return takes, gives
 
 
-def _compare(
-    what: str, nodes: list[Any], wanted: Mapping[str, tuple[str, tuple[int, ...]]]
-) -> None:
+def _compare(what: str, nodes: list[Any], wanted: Signature) -> None:
     """Compare inputs or outputs by name, type and shape; the first axis must be free."""
     found = {node.name: (node.type, tuple(node.shape)) for node in nodes}
     fits = found.keys() == wanted.keys() and all(
         found[name][0] == kind
-        and found[name][1][1:] == shape
+        and found[name][1][1:] == tuple(shape)
         and not isinstance(found[name][1][0], int)
         for name, (kind, shape) in wanted.items()
     )

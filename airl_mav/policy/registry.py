@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import constants, errors, plugins
 from airl_mav.core.plugins import announced, digest_of, load_part, names_code, reference
+from airl_mav.policy import card as cards
 from airl_mav.policy.actions import (
     Action,
     ActionSpec,
@@ -28,24 +29,6 @@ from airl_mav.policy.actions import (
     command,
     command_kind,
     discrete_actions,
-)
-from airl_mav.policy.card import (
-    CARD_FILE,
-    ONNX_FILE,
-    TORCH_FILE,
-    Memory,
-    PolicyCard,
-    Runtime,
-    RuntimeName,
-    TorchRuntime,
-    blank_memory,
-    check_trust,
-    load_card,
-    open_model,
-    outputs_of,
-    read_card,
-    read_torch_program,
-    vehicle_mismatch,
 )
 from airl_mav.policy.layouts import ablated, boxes, encode_layout
 from airl_mav.policy.observation import Observation
@@ -64,8 +47,8 @@ class LearnedPolicy:
 
     def __init__(
         self,
-        card: PolicyCard,
-        runtime: Runtime,
+        card: cards.PolicyCard,
+        runtime: cards.Runtime,
         *,
         rng: np.random.Generator | None = None,
         ablate: str | None = None,
@@ -84,8 +67,9 @@ class LearnedPolicy:
         self._ablate = ablate
         self._fitting: tuple[Intrinsics, ...] = ()
         """Intrinsics of the cameras that passed the check."""
-        self._memory: Memory | None = None
+        self._memory: cards.Memory | None = None
         """Memory of the network; None before the first decision."""
+        self._count = cards.outputs_of(card.actions)
 
     @property
     def name(self) -> str:
@@ -141,16 +125,19 @@ class LearnedPolicy:
         """Return a score (n, k) for each discrete action, or the action, of n flights.
 
         A network with memory updates its memory. Raises ValueError if the number of flights
-        changed.
+        changed, or the outputs have another shape.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)
-        return self._remembering(encoded) if self.card.state else self._runtime.infer(encoded)
-
-    def _remembering(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the outputs of a network with memory, and update the memory."""
         n = len(next(iter(encoded.values())))
-        memory = blank_memory(self.card.state, n) if self._memory is None else self._memory
+        outputs = self._remembering(encoded, n) if self.card.state else self._runtime.infer(encoded)
+        if outputs.shape != (n, self._count):
+            raise ValueError(f"output {outputs.shape}; accepted: {(n, self._count)}")
+        return outputs
+
+    def _remembering(self, encoded: Mapping[str, NDArray[Any]], n: int) -> NDArray[np.float32]:
+        """Return the outputs of a network with memory, and update the memory."""
+        memory = cards.blank_memory(self.card.state, n) if self._memory is None else self._memory
         known = len(next(iter(memory.values())))
         if known != n:
             raise ValueError(f"{n} flights; accepted: {known}, as at the first decision")
@@ -186,9 +173,9 @@ def decide(
 
 def load_learned(
     folder: Path,
-    card: PolicyCard | None = None,
+    card: cards.PolicyCard | None = None,
     *,
-    runtime: RuntimeName = "onnx",
+    runtime: cards.RuntimeName = "onnx",
     threads: int = 1,
     rng: np.random.Generator | None = None,
     ablate: str | None = None,
@@ -201,24 +188,26 @@ def load_learned(
     the first decision in flight is as fast as the others. Raises UsageError if card and policy do
     not match, or the runtime is not installed or not trusted.
     """
-    card = card or read_card(folder)
-    check_trust(folder, card, trust=trust)
+    card = card or cards.read_card(folder)
+    cards.check_trust(folder, card, trust=trust)
     network = open_network(folder, card, runtime, threads, trust=trust)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     blank = {k: np.zeros((1, *box.shape), box.dtype) for k, box in boxes(card.observation).items()}
-    if card.state:
-        outputs, _ = network.step(blank, blank_memory(card.state, 1))
-    else:
-        outputs = network.infer(blank)
-    found, wanted = outputs.shape, (1, outputs_of(card.actions))
-    if found != wanted:
-        raise errors.UsageError(f"policy {card.name}: output {found}; accepted: {wanted}")
+    try:
+        policy.with_generator(np.random.default_rng()).outputs(blank)
+    except Exception as error:  # Of any type, also from a torch program.
+        raise errors.UsageError(f"policy {card.name}: {' '.join(str(error).split())}") from None
     return policy
 
 
 def open_network(
-    folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int, *, trust: bool = False
-) -> Runtime:
+    folder: Path,
+    card: cards.PolicyCard,
+    runtime: cards.RuntimeName,
+    threads: int,
+    *,
+    trust: bool = False,
+) -> cards.Runtime:
     """Return the network of a card, ready for its first inference; `torch` takes `policy.pt2`.
 
     `trust` permits the folder's author to run code on this machine: `torch.export.load` falls back
@@ -226,18 +215,17 @@ def open_network(
     package are trusted. A card may name code, too. Raises UsageError as `load_learned`.
     """
     if runtime == "onnx":
-        return open_model(folder, card, threads, trust=trust)
-    program = read_torch_program(folder, card)
-    shipped = folder.resolve().is_relative_to((profiles_dir() / "policies").resolve())
-    if not (trust or shipped):
+        return cards.open_model(folder, card, threads, trust=trust)
+    program = cards.read_torch_program(folder, card)
+    if not (trust or cards.is_shipped(folder)):
         raise errors.UsageError(
-            f"{folder}: its {TORCH_FILE} can run any code on this machine; accepted: with --trust, "
-            "if you trust its maker, or with the onnx runtime"
+            f"{folder}: its {cards.TORCH_FILE} can run any code on this machine; accepted: with"
+            " --trust, if you trust its maker, or with the onnx runtime"
         )
     try:
-        return TorchRuntime(program, card.observation, threads, card.state)
+        return cards.TorchRuntime(program, card.observation, threads, card.state)
     except ValueError as error:
-        raise errors.UsageError(f"{folder / TORCH_FILE}: {error}") from None
+        raise errors.UsageError(f"{folder / cards.TORCH_FILE}: {error}") from None
 
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
@@ -256,7 +244,7 @@ class PolicyInfo:
     name: str
     """Short name, also for folders."""
     description: str
-    card: PolicyCard | None = None
+    card: cards.PolicyCard | None = None
     """Policy card; None = not a learned policy."""
     folder: Path | None = None
     """Folder of a learned policy."""
@@ -296,7 +284,7 @@ def camera_refused(policy: PolicyInfo, vehicle: VehicleProfile) -> str | None:
     if policy.asked is not None:
         return None
     if policy.card is not None:
-        return vehicle_mismatch(policy.card, camera, vehicle.cameras)
+        return cards.vehicle_mismatch(policy.card, camera, vehicle.cameras)
     if policy.program is None and camera.kind != "depth":
         return f"{camera.kind} camera; accepted: depth"
     if policy.program is None and camera.yaw_deg != 0.0:
@@ -322,7 +310,7 @@ def find_policy(name: str, *, trust: bool = False) -> PolicyInfo:
     folder = _folder(name)
     if folder is None:
         return PolicyInfo(name, _summary(name), program=announced(plugins.POLICIES)[name])
-    card = load_card(folder, trust=trust)
+    card = cards.load_card(folder, trust=trust)
     return PolicyInfo(card.name, card.description, card, folder)
 
 
@@ -330,7 +318,7 @@ def load_policy(
     policy: PolicyInfo | str,
     hold_s: float,
     *,
-    runtime: RuntimeName = "onnx",
+    runtime: cards.RuntimeName = "onnx",
     threads: int = 1,
     rng: np.random.Generator | None = None,
     ablate: str | None = None,
@@ -364,7 +352,9 @@ def load_policy(
 
 def _shipped() -> list[str]:
     """Return the names of the shipped policies, sorted."""
-    return sorted(path.parent.name for path in (profiles_dir() / "policies").glob(f"*/{CARD_FILE}"))
+    return sorted(
+        path.parent.name for path in (profiles_dir() / "policies").glob(f"*/{cards.CARD_FILE}")
+    )
 
 
 def _folder(name: str) -> Path | None:
@@ -379,7 +369,8 @@ def _folder(name: str) -> Path | None:
     known = ", ".join([*policy_names(), *announced(plugins.POLICIES)])
     raise errors.UsageError(
         f"--policy {name!r}: no such policy; known: {known}"
-        f" (or a path to a folder with {ONNX_FILE} and {CARD_FILE}, FILE.py:CLASS or MODULE:CLASS)"
+        f" (or a path to a folder with {cards.ONNX_FILE} and {cards.CARD_FILE}, FILE.py:CLASS or"
+        " MODULE:CLASS)"
     )
 
 

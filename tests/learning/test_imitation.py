@@ -40,6 +40,7 @@ class Taught:
 
     def __init__(self, navigation: Navigation, name: ExpertName) -> None:
         self.expert, self.actions = StatefulExpert(name, navigation), navigation.spec.action_spec
+        self.failed: dict[int, str] = {}
 
     def begin(self, slot: int, seed: int) -> None:
         self.expert.begin([slot])

@@ -24,7 +24,7 @@ from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy import registry
+from airl_mav.policy import card as cards
 from airl_mav.policy.actions import Action, ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, PolicyCard, Runtime, TorchRuntime, read_card
 from airl_mav.policy.card_writing import write_card
@@ -130,7 +130,7 @@ def test_a_torch_program_runs_only_when_its_maker_is_trusted(
     # A policy that is shipped with the package.
     (folder.parent / "policies").mkdir()
     shipped = folder.rename(folder.parent / "policies" / folder.name)
-    monkeypatch.setattr(registry, "profiles_dir", lambda: shipped.parents[1])
+    monkeypatch.setattr(cards, "profiles_dir", lambda: shipped.parents[1])
     assert load_learned(shipped, runtime="torch").card.name
 
 
@@ -214,19 +214,20 @@ def test_chance_has_its_share_and_its_seed(exported: Path) -> None:
     card = read_card(exported / "discrete").model_copy(update={"epsilon": 0.3})
     scores = np.zeros((20_000, 25), np.float32)
     scores[:, 11] = 1.0
+    seen = {"goal": np.zeros((20_000, 3), np.float32)}
     policy = LearnedPolicy(card, Answers(scores))
-    chosen = policy.act_batch({}, np.random.default_rng(4))
+    chosen = policy.act_batch(seen, np.random.default_rng(4))
     # 24 of 25 random actions are others: 0.288, sd 0.0032.
     assert np.mean(chosen != 11) == pytest.approx(0.3 * 24 / 25, abs=0.015)
     counts = np.bincount(chosen, minlength=25)
     others = np.delete(counts, 11)
     assert others.min() > 0.8 * 20_000 * 0.3 / 25
     assert others.max() < 1.2 * 20_000 * 0.3 / 25
-    again = policy.with_generator(np.random.default_rng(4)).act_batch({})
+    again = policy.with_generator(np.random.default_rng(4)).act_batch(seen)
     np.testing.assert_array_equal(again, chosen)
-    assert (policy.act_batch({}, np.random.default_rng(5)) != chosen).any()
+    assert (policy.act_batch(seen, np.random.default_rng(5)) != chosen).any()
     with pytest.raises(ValueError, match="needs a random generator"):
-        policy.act_batch({})
+        policy.act_batch(seen)
 
 
 def test_without_epsilon_nothing_is_drawn(exported: Path) -> None:
@@ -326,7 +327,7 @@ def test_policies_are_found_by_name_and_by_path(
     assert find_policy("./continuous").name == "continuous"
 
     # As shipped: profiles/policies/<name>/
-    monkeypatch.setattr(registry, "profiles_dir", lambda: exported.parent / "shipped")
+    monkeypatch.setattr(cards, "profiles_dir", lambda: exported.parent / "shipped")
     shutil.copytree(exported, exported.parent / "shipped" / "policies")
     monkeypatch.chdir("/")
     assert policy_names() == ["greedy", "continuous", "discrete"]

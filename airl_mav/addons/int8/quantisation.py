@@ -145,6 +145,10 @@ class _Witness:
     policy: LearnedPolicy
     seen: list[Encoded] = field(default_factory=list)
 
+    @property
+    def failed(self) -> Mapping[int, str]:
+        return self.pilots.failed
+
     def begin(self, slot: int, seed: int) -> None:
         self.pilots.begin(slot, seed)
 
