@@ -27,7 +27,7 @@ from pyulog.exceptions import ULogException
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate, correlation_lags
 
-from airl_mav.core import constants, errors, frames
+from airl_mav.core import constants, errors, files, frames
 from airl_mav.flight.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -42,6 +42,7 @@ _BROKEN = (
     EOFError,
     IndexError,
     KeyError,
+    RecursionError,
     TypeError,
     UnicodeDecodeError,
     ValueError,
@@ -153,12 +154,34 @@ _PARTLY_NAN = ("setpoint", "more_than_velocity", "nav_state", "battery")
 """Series in which NaN has a meaning; samples with NaN are removed from all others."""
 
 
+class _LimitedLog(ULog):  # type: ignore[misc]
+    """Reader that ends for any file: with limits of damaged places, and of a message's fields."""
+
+    left = 1_000_000
+
+    def _check_packet_corruption(self, header: Any) -> bool:
+        # pyulog goes back by the size of a damaged message, and would search the same place again.
+        self.left -= (found := bool(super()._check_packet_corruption(header)))
+        if self.left < 0:
+            raise ULogException("too many damaged places")
+        return found
+
+    class _MessageAddLogged(ULog._MessageAddLogged):  # type: ignore[misc]
+        left = 1 << 16
+
+        def _parse_nested_type(self, prefix: str, name: str, formats: Mapping[str, Any]) -> None:
+            self.left -= 1 + sum(max(size, 1) for _, size, _ in formats[name].fields)
+            if self.left < 0:
+                raise ULogException(f"{name}: too many fields")
+            super()._parse_nested_type(prefix, name, formats)
+
+
 def read_vehicle_log(path: Path) -> VehicleLog:
     """Read a .ulg file; raise UsageError without attitude or velocity."""
     accepted = "a ULog (.ulg) with vehicle_attitude and vehicle_local_position"
     try:
-        with path.open("rb") as file:
-            read = ULog(file, sorted({topic for topic, _ in _SERIES.values()}))
+        with files.open_regular(path) as file:
+            read = _LimitedLog(file, sorted({topic for topic, _ in _SERIES.values()}))
     except OSError as error:
         raise errors.UsageError(f"{path}: {error.strerror}") from None
     except _BROKEN:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import PlacedMesh
 from airl_mav.core.errors import UsageError
+from airl_mav.core.files import check_inflated
 from airl_mav.profiles import assets, loading
 
 KEPT = 16
@@ -85,6 +86,7 @@ def decoded(data: bytes, source: str) -> Triangles:
     """Return the triangles in a file's data, or UsageError naming `source`."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            check_inflated(archive.zip)
             vertices, faces = archive["vertices"], archive["faces"]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         told = " ".join(f"{error}".split())

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from pydantic import TypeAdapter, ValidationError
 
 from airl_mav.black_box.messages import JSON, TOPICS, Channel, Message, encoded
-from airl_mav.core import clock, errors
+from airl_mav.core import clock, errors, files
 
 METADATA = "airl-mav"
 """Name of the metadata record that describes the run."""
@@ -126,8 +126,10 @@ def read_black_box(path: Path) -> BlackBox:
     """Read a black box up to its end or first damage; raise UsageError for other files."""
     box = None
     try:
-        with path.open("rb") as file:
-            reader = StreamReader(file, validate_crcs=True, record_size_limit=_RECORD_BYTES)
+        with files.open_regular(path) as file:
+            reader = StreamReader(
+                file, emit_chunks=True, validate_crcs=True, record_size_limit=_RECORD_BYTES
+            )
             for record in _whole_records(reader):
                 if isinstance(record, Metadata) and record.name == METADATA and box is None:
                     box = BlackBox(path, dict(json.loads(record.metadata[RUN])))

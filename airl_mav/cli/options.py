@@ -239,7 +239,8 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     """Run the command of a module and exit with its status.
 
     The module has `OPTIONS`, the model of its options, `run(options) -> exit status`, and
-    optionally `EXTRAS`, its additional requirements. Errors become one line and exit status 2 or 1.
+    optionally `EXTRAS`, its additional requirements, and `READS_FILES`, True if the command only
+    reads files, whose content may raise any error. Errors become one line and exit status 2 or 1.
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
@@ -287,6 +288,20 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
         options_model = type(options)
         file = _scenario_file(options_model, words)
         raise errors.UsageError(told(error, words, file, _positionals(options_model))) from None
+    except (
+        ArithmeticError,
+        LookupError,
+        MemoryError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+    ) as error:
+        if not getattr(command, "READS_FILES", False):
+            raise
+        problem = " ".join(f"{type(error).__name__}: {error}".split())
+        raise errors.UsageError(
+            f"{' '.join(words)}: damaged, or changed since it was written: {problem}"
+        ) from error
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:

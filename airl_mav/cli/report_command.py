@@ -39,8 +39,8 @@ class ReportOptions(fields.ProfileModel):
     )
     out: Path | None = Field(
         default=None,
-        description="folder of a comparison; by default runs/<UTC time>-compare. A report goes into"
-        " its run's own folder",
+        description="folder of the pages and pictures; by default that of the run, or of a new"
+        " comparison runs/<UTC time>-compare",
     )
     ulg: Path | None = Field(
         default=None,
@@ -54,6 +54,7 @@ class ReportOptions(fields.ProfileModel):
 
 
 OPTIONS = ReportOptions
+READS_FILES = True
 
 
 def run(options: ReportOptions, console: Console | None = None) -> int:
@@ -73,9 +74,11 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
                 trust_arenas(load(folder))
     if len(options.runs) > 1 or kind_of(first) == "matrix":
         return _compare(options, console)
-    for field, value in (("out", options.out), ("names", " ".join(options.names))):
-        if value:
-            raise errors.FieldError(field, f"{value}", "with two runs or more")
+    if options.names:
+        raise errors.FieldError("names", " ".join(options.names), "with two runs or more")
+    out = options.out or first
+    with errors.usage_errors(f"--out {out}"):
+        out.mkdir(parents=True, exist_ok=True)
     if kind_of(first) is None:
         # Imported here and below: options do not need the figures.
         from airl_mav.report import theme
@@ -83,12 +86,12 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
         from airl_mav.report.run_verdict import verdict_of
 
         loaded = load(first)
-        with theme.figure_files(first, options.figures):
-            show_report(loaded, verdict_of(loaded), console)
+        with theme.figure_files(out, options.figures):
+            show_report(loaded, verdict_of(loaded), console, out=out)
     else:
         from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
 
-        show_comparison(*rebuild_comparison(first), first, console)
+        show_comparison(*rebuild_comparison(first), out, console)
     return 0
 
 

@@ -47,6 +47,12 @@ CRC = "crc32"
 DEEPEST = 100
 """Maximum nesting of lists and tables in a JSON file."""
 
+JSON_BYTES, LINES_BYTES = 16 << 20, 100 << 20
+"""Maximum sizes of a JSON file and a file of JSON lines."""
+
+INFLATED_BYTES, RATIO = 200 << 20, 8
+"""Maximum size of all arrays in an archive: the larger of a size and a multiple of the file's."""
+
 
 # --- whole files
 
@@ -142,6 +148,14 @@ def subfolder(folder: Path, name: str) -> Path:
     return folder
 
 
+def remove(path: Path) -> None:
+    """Remove a file, a link, or a folder with its content, if it exists. Raises OSError."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
 def try_lock(descriptor: int) -> bool:
     """Lock a file or folder; return False if another process has locked it."""
     try:
@@ -153,28 +167,38 @@ def try_lock(descriptor: int) -> bool:
     return True
 
 
-def read_file(path: Path, most_bytes: int) -> bytes:
-    """Return the content of a foreign file; reads regular files alone, up to a size.
+def open_regular(path: Path, *, links: bool = True) -> IO[bytes]:
+    """Open a regular file to read; a pipe or a device, which may never end, is rejected.
 
-    Raises UsageError for a larger file, a pipe or device, or a system error.
+    Without `links`, links that lead out of the file's folder are rejected. Raises UsageError.
     """
-    with usage_errors(path), open(path, "rb", opener=_without_waiting) as file:
-        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            data = file.read(most_bytes + 1)
-            if len(data) <= most_bytes:
-                return data
-            raise UsageError(f"{path}: accepted: up to {most_bytes:,} bytes")
-    raise UsageError(f"{path}: accepted: a regular file")
+    with usage_errors(path):
+        # Path.resolve raises RuntimeError for a loop.
+        real, folder = map(os.path.realpath, (path, path.parent))
+        if not links and not Path(real).is_relative_to(folder):
+            raise UsageError(f"{path}: a link out of its folder; accepted: a file; copy it there")
+        file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb")
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise UsageError(f"{path}: accepted: a regular file")
+    return file
 
 
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a file; a pipe does not wait for its writer."""
-    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)
+def read_limited(path: Path, what: str, most: int, *, links: bool = True) -> bytes:
+    """Return the content of a file of at most `most` bytes; `what` is its name in messages.
+
+    For `links` and errors see `open_regular`.
+    """
+    with open_regular(path, links=links) as file, usage_errors(path):
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise UsageError(f"{path}: accepted: {what} of at most {most:,} bytes")
+    return data
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file, hexadecimal. Raises OSError."""
-    with path.open("rb") as file:
+    """Return the SHA-256 of a file, hexadecimal. Raises OSError, or UsageError for a pipe."""
+    with open_regular(path) as file:
         digest = hashlib.sha256()
         while block := file.read(1 << 20):
             digest.update(block)
@@ -209,14 +233,6 @@ def _opened_folder(path: Path) -> Iterator[int]:
         os.close(descriptor)
 
 
-def remove(path: Path) -> None:
-    """Remove a file, a link, or a folder with its content. Raises OSError."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
-
-
 # --- JSON
 
 
@@ -233,8 +249,9 @@ def read_json(path: Path, schema: int | None, what: str) -> dict[str, Any]:
     folder's content in messages. Raises UsageError if the file is missing, not JSON, damaged, or of
     another version.
     """
-    with usage_errors(f"{path.parent}: no {what} here: {path.name}"):
-        data = path.read_bytes()
+    if not path.exists():
+        raise UsageError(f"{path.parent}: no {what} here: {path.name}: {os.strerror(errno.ENOENT)}")
+    data = read_limited(path, what, JSON_BYTES, links=False)
     try:
         return _opened(data, schema)
     except ValueError as error:
@@ -287,28 +304,30 @@ def json_line(data: Mapping[str, Any]) -> bytes:
     return _compact(_sealed(data)) + b"\n"
 
 
-def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]]]:
-    """Return the objects of a file of JSON lines, each with its location: "path:number".
+def read_lines(path: Path, schema: int | None) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the objects of a file of JSON lines, each with its location: "path:number".
 
-    A last line without a newline was cut short by a kill and is ignored. A missing file gives an
-    empty list. For `schema` and errors see `read_json`.
+    A last line without a newline was cut short by a kill and is ignored. A missing file has no
+    lines. For `schema` and errors see `read_json`.
     """
-    data = b""
-    with usage_errors(path), suppress(FileNotFoundError):
-        data = path.read_bytes()
-    *whole, rest = data.split(b"\n")
-    found = []
-    for number, line in enumerate(whole, start=1):
+    if not os.path.lexists(path):
+        return
+    data = read_limited(path, "lines", LINES_BYTES, links=False)
+    number, rest = 1, b""
+    for number, line in enumerate(io.BytesIO(data), start=1):
+        if not line.endswith(b"\n"):
+            rest = line
+            break
         try:
-            found.append((f"{path}:{number}", _opened(line, schema)))
+            found = _opened(line, schema)
         except ValueError as error:
             raise UsageError(f"{path}:{number}: {error}") from None
+        yield f"{path}:{number}", found
     # A kill leaves only the beginning of a line. A complete line with another byte in place of its
     # newline was damaged later.
     with suppress(ValueError, RecursionError):
         if isinstance(json.loads(rest[:-1]), dict):
-            raise UsageError(f"{path}:{len(whole) + 1}: damaged: no newline at its end")
-    return found
+            raise UsageError(f"{path}:{number}: damaged: no newline at its end")
 
 
 def cut_torn_line(path: Path) -> None:
@@ -436,16 +455,19 @@ def read_groups(path: Path, groups: Collection[str]) -> dict[str, ArrayGroup]:
 
     An archive without its directory, or with an array cut short by a kill, is read as well.
     """
-    if not path.exists():
+    if not os.path.lexists(path):
         return {}
     try:
-        with _archive(path.read_bytes(), groups) as archive:
+        with open_regular(path, links=False) as file, _archive(file.read(), groups) as archive:
+            check_inflated(archive)
             found = {}
             for group, members in groupby(archive.infolist(), _group_of):
                 held = list(members)
                 arrays = {_array_name(each): _read_array(archive, each) for each in held}
                 found[group] = ArrayGroup(arrays, _group_crc(held))
             return found
+    except UsageError:
+        raise
     except Exception as error:  # Bit errors may request passwords or unknown methods.
         raise UsageError(f"{path}: damaged: {' '.join(str(error).split())[:200]}") from None
 
@@ -456,6 +478,13 @@ field; extra field for sizes above 4 GB, which NumPy always writes."""
 
 _END, _END_SIZE = b"PK\5\6", 22
 """Signature and size of the record after the directory."""
+
+
+def check_inflated(archive: zipfile.ZipFile) -> None:
+    """Raise ValueError for an archive with much more data than its file has bytes."""
+    total = sum(member.file_size for member in archive.infolist())
+    if total > (most := max(INFLATED_BYTES, RATIO * archive.start_dir)):
+        raise ValueError(f"{total:,} bytes of arrays; accepted: at most {most:,}")
 
 
 def _archive(

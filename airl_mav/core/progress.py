@@ -8,6 +8,7 @@ returns the console of a command, without rich's markup in paths and messages.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -23,6 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as RichBars
+from rich.segment import Segment
 from rich.spinner import Spinner
 from rich.table import Column
 from rich.text import Text
@@ -41,7 +43,23 @@ PACE_S = 600.0
 """The remaining time is estimated from the pace over this interval [wall s]."""
 
 
-new_console = partial(Console, markup=False, emoji=False)
+_CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Control characters, which steer a terminal; tab and newline are none."""
+
+
+class _SafeConsole(Console):
+    """Console without the control characters of printed texts, which may come from a file."""
+
+    def _render_buffer(self, buffer: Iterable[Segment]) -> str:
+        return super()._render_buffer(
+            each
+            if each.control
+            else Segment(_CONTROLS.sub("\N{REPLACEMENT CHARACTER}", each.text), each.style)
+            for each in buffer
+        )
+
+
+new_console = partial(_SafeConsole, markup=False, emoji=False)
 """Factory of consoles that print square brackets and `:name:` as they are."""
 
 

@@ -30,7 +30,7 @@ from airl_mav.core.compiling import writable_folder
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
-from airl_mav.core.files import read_file, read_json
+from airl_mav.core.files import read_json, read_limited
 from airl_mav.policy.actions import (
     ACTION_SETS,
     ActionSpec,
@@ -306,7 +306,7 @@ def vehicle_mismatch(
 
 def _read_bound(path: Path, sha256: str) -> bytes:
     """Return a file's bytes if they match the digest. Raises UsageError."""
-    data = read_file(path, MODEL_BYTES)
+    data = read_limited(path, "a network", MODEL_BYTES, links=False)
     if (found := digest(data)) != sha256:
         raise UsageError(
             f"{path}: SHA-256 {found[:12]}...; accepted: {sha256[:12]}..., that of {CARD_FILE}"
@@ -502,11 +502,8 @@ def _terminator() -> None:
 Signature = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays by name: ONNX type, and shape without the leading axis."""
 
-TRIAL_BYTES = 1 << 30
-"""Maximum address space of a trial; a process with ONNX Runtime takes 150 MB."""
-
-TRIAL_BYTES_OF_MODEL = 6
-"""Additional address space of a trial per byte of the model: its copies."""
+TRIAL_BYTES, COPIES = 1 << 30, 6
+"""Maximum address space of a trial, of which ONNX Runtime takes 150 MB, and copies of the model."""
 
 TRIAL_S = 20.0
 """Timeout of a trial, with the start of the child [wall s]."""
@@ -522,7 +519,7 @@ def _try_limited(model: bytes, card: PolicyCard) -> None:
     record = None if folder is None else folder / digest(card.sha256.encode() + arrays)
     if record is not None and record.exists():
         return
-    memory = TRIAL_BYTES + TRIAL_BYTES_OF_MODEL * len(model)
+    memory = TRIAL_BYTES + COPIES * len(model)
     try:
         found = run_limited(f"{__name__}:try_model", b"%b\n%b" % (arrays, model), memory, TRIAL_S)
     except ValueError as error:

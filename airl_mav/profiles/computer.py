@@ -17,11 +17,14 @@ from pydantic import Field, model_validator
 from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, later_field, optional, quantity, switch
-from airl_mav.core.files import replace_file
+from airl_mav.core.files import read_limited, replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
 LONGEST_MS = 60_000.0
 """Maximum latency [ms]; a decision slower than a minute is assumed to be a mistake in the file."""
+
+SAMPLES_BYTES = 10 << 20
+"""Maximum size of a file of measured latencies."""
 
 Distribution = Literal["fixed", "lognormal", "normal-truncated", "samples"]
 
@@ -212,7 +215,7 @@ def read_samples(path: Path, option: str) -> tuple[float, ...]:
     contains anything but latencies in (0, 60000] ms.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_limited(path, "latencies", SAMPLES_BYTES).decode().splitlines()
         values = np.array([float(text) for line in lines if (text := line.split("#")[0].strip())])
     except OSError as error:
         raise UsageError(f"{path}: {option}: {error.strerror}") from None

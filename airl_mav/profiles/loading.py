@@ -18,9 +18,9 @@ from pydantic import (
     model_serializer,
 )
 
-from airl_mav.core.errors import UsageError, shown, usage_errors
+from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import ProfileModel, optional, validated
-from airl_mav.core.files import DEEPEST, deeper_than
+from airl_mav.core.files import DEEPEST, deeper_than, read_limited
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -117,7 +117,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file. Raises UsageError."""
-    data = read_limited(path, "a profile")
+    data = read_limited(path, "a profile", MOST_BYTES)
     try:
         found = tomllib.loads(data.decode())
         too_deep = deeper_than(found, DEEPEST)
@@ -128,15 +128,6 @@ def read_toml(path: Path) -> dict[str, Any]:
     if too_deep:
         raise UsageError(f"{path}: nested too deep: accepted: {DEEPEST} levels")
     return found
-
-
-def read_limited(path: Path, what: str, most: int = MOST_BYTES) -> bytes:
-    """Return the content of a file of at most `most` bytes. Raises UsageError."""
-    with usage_errors(path), path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise UsageError(f"{path}: accepted: {what} of at most {most:,} bytes")
-    return data
 
 
 def _anchor_files(data: object, folder: Path) -> None:
@@ -218,11 +209,7 @@ class CheckedFile(ProfileModel):
 
 def read_checked(named: CheckedFile) -> bytes:
     """Return the bytes of a file. Raises UsageError if missing or the digest differs."""
-    path = Path(named.file)
-    with usage_errors(path):
-        if path.exists() and not path.is_file():
-            raise UsageError(f"{path}: no file")
-    data = read_limited(path, "a file", MOST_FILE_BYTES)
+    data = read_limited(Path(named.file), "a file", MOST_FILE_BYTES)
     found = hashlib.sha256(data).hexdigest()
     if found != named.sha256:
         raise UsageError(

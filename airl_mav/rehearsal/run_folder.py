@@ -197,8 +197,7 @@ class RunFolder:
         """Remove files of unfinished episodes, but keep the logs of a killed firmware."""
         for pattern in (".*.npz*", f"*{files.TEMPORARY_SUFFIX}"):
             for leftover in self.path.glob(pattern):
-                if not leftover.is_dir():  # Of somebody else: temporary files are no folders.
-                    leftover.unlink()
+                files.remove(leftover)
         for log in self.path.glob(f"flight-*{PARTIAL_SUFFIX}"):
             log.rename(log.with_suffix(""))
 

@@ -377,11 +377,15 @@ def show_report(
     *,
     draw: bool = True,
     tables: bool = True,
+    out: Path | None = None,
 ) -> Path | None:
-    """Print `tables` of a run, `draw` and print its page, then print the verdict; save both."""
+    """Print `tables` of a run, `draw` and print its page, then print the verdict; save both.
+
+    `out` is the folder of the files; None = the run's.
+    """
     progress = progress or Progress()
     if run.episodes:
-        run_verdict.save_verdict(verdict, run.path)
+        run_verdict.save_verdict(verdict, out or run.path)
     if tables:
         print_report(run, console)
     page: Path | None = None
@@ -392,7 +396,7 @@ def show_report(
         progress.status(DRAWING)
         progress.line(DRAWING)
         try:
-            page = write_report(run, verdict=verdict)
+            page = write_report(run, out, verdict=verdict)
         except KeyboardInterrupt:
             print_verdict(verdict.lines, console)
             raise

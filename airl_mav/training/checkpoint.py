@@ -13,6 +13,7 @@ import pickle
 import random
 import shutil
 import warnings
+import zipfile
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -27,18 +28,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from airl_mav.core import files
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import (
-    Arrays,
-    json_line,
-    read_json,
-    remove,
-    replace_file,
-    replacing,
-    save_arrays,
-    sha256_of,
-    sync_folder,
-)
 
 COUNTERS = (
     "num_timesteps",
@@ -66,7 +57,7 @@ class Restorable(Protocol):
         """Restore the state from `get_state`."""
 
 
-def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
+def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], files.Arrays, dict[str, Any]]:
     """Return the state of a learner and its environment: weights, arrays, the rest."""
     weights: dict[str, Any] = {
         "states": model.get_parameters(),
@@ -100,7 +91,7 @@ def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any
 
 
 def restore(
-    model: BaseAlgorithm, weights: dict[str, Any], arrays: Arrays, state: dict[str, Any]
+    model: BaseAlgorithm, weights: dict[str, Any], arrays: files.Arrays, state: dict[str, Any]
 ) -> None:
     """Restore the state from `collect`; KeyError, RuntimeError or ValueError if it does not fit."""
     model.set_parameters(weights["states"], exact_match=True, device=model.device)
@@ -174,14 +165,14 @@ def _env(model: BaseAlgorithm) -> Restorable:
     return cast("Restorable", model.env)
 
 
-def _below(prefix: str, arrays: Arrays) -> Arrays:
+def _below(prefix: str, arrays: files.Arrays) -> files.Arrays:
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
-def _get_replay(model: BaseAlgorithm) -> Arrays:
+def _get_replay(model: BaseAlgorithm) -> files.Arrays:
     """Return the filled part of a learner's replay memory by name; empty without replay memory."""
     if (own := getattr(model, "replay", None)) is not None:
-        state: Arrays = own.get_state()
+        state: files.Arrays = own.get_state()
         return state
     buffer = _stock_buffer(model)
     if buffer is None:
@@ -209,9 +200,9 @@ def _stock_buffer(model: BaseAlgorithm) -> DictReplayBuffer | None:
     return buffer if isinstance(buffer, DictReplayBuffer) else None
 
 
-def _stock_arrays(buffer: DictReplayBuffer) -> Arrays:
+def _stock_arrays(buffer: DictReplayBuffer) -> files.Arrays:
     names = ("actions", "rewards", "dones", "timeouts")
-    arrays: Arrays = {name: getattr(buffer, name) for name in names}
+    arrays: files.Arrays = {name: getattr(buffer, name) for name in names}
     arrays |= {f"observations/{key}": array for key, array in buffer.observations.items()}
     return arrays | {f"next/{key}": array for key, array in buffer.next_observations.items()}
 
@@ -224,6 +215,7 @@ LATEST = "latest"
 PREFIX = "checkpoint-"
 PARTIAL = ".partial"
 DAMAGED = ".damaged"
+_BROKEN = (EOFError, pickle.UnpicklingError, zipfile.BadZipFile)
 WEIGHTS, ARRAYS, STATE, MANIFEST = "weights.pt", "arrays.npz", "state.json", "manifest.json"
 
 
@@ -235,7 +227,7 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
     """Write a checkpoint with JSON data `meta`; return its folder. Keeps the previous one."""
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f"{PREFIX}*{PARTIAL}"):
-        remove(leftover)
+        files.remove(leftover)
     there = _all(folder)
     final = folder / f"{PREFIX}{_serial(there[-1]) + 1 if there else 1:06d}"
     partial = final.with_name(final.name + PARTIAL)
@@ -246,24 +238,24 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
         shutil.rmtree(partial, ignore_errors=True)
         raise
     partial.rename(final)
-    sync_folder(folder)
-    replace_file(folder / LATEST, f"{final.name}\n".encode())
+    files.sync_folder(folder)
+    files.replace_file(folder / LATEST, f"{final.name}\n".encode())
     for old in _all(folder)[:-KEEP]:
         # A partly removed folder must not look like a checkpoint.
-        remove(old.rename(old.with_name(old.name + PARTIAL)))
+        files.remove(old.rename(old.with_name(old.name + PARTIAL)))
     return final
 
 
 def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None:
     """Write the files of a checkpoint and sync them to disk. Raises OSError."""
     weights, arrays, state = collect(model)
-    with replacing(partial / WEIGHTS) as path, path.open("wb") as file:
+    with files.replacing(partial / WEIGHTS) as path, path.open("wb") as file:
         torch.save(weights, file)
-    save_arrays(partial / ARRAYS, arrays)
+    files.save_arrays(partial / ARRAYS, arrays)
     text = json.dumps({"learner": state, "meta": meta}, default=_plain)
-    replace_file(partial / STATE, text.encode())
-    files = {name: sha256_of(partial / name) for name in (WEIGHTS, ARRAYS, STATE)}
-    replace_file(partial / MANIFEST, json_line({"schema": SCHEMA, "files": files}))
+    files.replace_file(partial / STATE, text.encode())
+    digests = {name: files.sha256_of(partial / name) for name in (WEIGHTS, ARRAYS, STATE)}
+    files.replace_file(partial / MANIFEST, files.json_line({"schema": SCHEMA, "files": digests}))
 
 
 def load_latest(
@@ -294,7 +286,7 @@ def load_latest(
         for old in damaged:
             # Damaged checkpoints do not count towards KEEP.
             aside = old.with_name(old.name + DAMAGED)
-            shutil.rmtree(aside, ignore_errors=True)
+            files.remove(aside)
             old.rename(aside)
         meta: dict[str, Any] = state["meta"]
         return meta
@@ -303,31 +295,34 @@ def load_latest(
     return None
 
 
-def _read(path: Path) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
+def _read(path: Path) -> tuple[dict[str, Any], files.Arrays, dict[str, Any]]:
     """Read a checkpoint. Raises DamagedError if its files do not match the manifest."""
     try:
-        manifest = read_json(path / MANIFEST, SCHEMA, "checkpoint")
+        files.subfolder(path.parent, path.name)
+        manifest = files.read_json(path / MANIFEST, SCHEMA, "checkpoint")
         for name in (WEIGHTS, ARRAYS, STATE):
-            if sha256_of(path / name) != manifest["files"][name]:
+            if files.sha256_of(path / name) != manifest["files"][name]:
                 raise DamagedError(f"{name} has changed since it was written")
         with np.load(path / ARRAYS, allow_pickle=False) as archive:
+            files.check_inflated(archive.zip)
             arrays = dict(archive)
         weights = torch.load(path / WEIGHTS, map_location="cpu", weights_only=True)
-        return weights, arrays, json.loads((path / STATE).read_text())
+        state = files.read_limited(path / STATE, "the state of a training", files.JSON_BYTES)
+        return weights, arrays, json.loads(state)
     except UsageError as error:
         raise DamagedError(str(error)) from None
     except OSError as error:
         name = Path(error.filename).name if error.filename else "a file"
         raise DamagedError(f"{name}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, pickle.UnpicklingError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, *_BROKEN):
         raise DamagedError(f"{MANIFEST} does not describe it") from None
 
 
 def _candidates(folder: Path) -> list[Path]:
     """Return the checkpoints in the order to try them."""
     there = _all(folder)[::-1]
-    with suppress(OSError, UnicodeDecodeError):
-        named = folder / (folder / LATEST).read_text().strip()
+    with suppress(UsageError, UnicodeDecodeError):
+        named = folder / files.read_limited(folder / LATEST, "a name", 4096).decode().strip()
         # False sorts first; the others stay newest first.
         there.sort(key=lambda path: path != named)
     return there
@@ -335,7 +330,7 @@ def _candidates(folder: Path) -> list[Path]:
 
 def _all(folder: Path) -> list[Path]:
     """Return the checkpoints of a run, oldest first."""
-    found = [path for path in folder.glob(f"{PREFIX}*") if path.name[len(PREFIX) :].isdigit()]
+    found = [path for path in folder.glob(f"{PREFIX}*") if path.name[len(PREFIX) :].isdecimal()]
     return sorted(found, key=_serial)
 
 

@@ -291,8 +291,6 @@ def test_what_cannot_be_compared_is_refused(runs: dict[str, Path], tmp_path: Pat
     with pytest.raises(UsageError, match="holds a run"):
         ask(fast, slow, out=fast)
     with pytest.raises(UsageError, match="accepted: with two runs or more"):
-        ask(fast, out=tmp_path / "out")
-    with pytest.raises(UsageError, match="accepted: with two runs or more"):
         ask(fast, names=("a",))
     RunFolder.create(tmp_path / "empty", "empty", {}, setup=demo_setup(), seeds=(1,))
     with pytest.raises(UsageError, match="no flight was finished"):

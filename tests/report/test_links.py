@@ -133,7 +133,7 @@ def test_arrays_are_not_appended_to_links(plant: Plant, run: Path) -> None:
 
 def test_a_resumed_run_does_not_truncate_links(plant: Plant, run: Path) -> None:
     plant(run / EPISODES_FILE)
-    with pytest.raises(UsageError, match=f"{EPISODES_FILE}: {REFUSED}"):
+    with pytest.raises(UsageError, match=f"{EPISODES_FILE}: a link"):
         RunFolder.resume(run)
 
 
@@ -181,6 +181,46 @@ def test_exports_write_their_folder_alone(plant: Plant, run: Path) -> None:
     for kind in ("ulog", "mcap"):
         export_log.run(export_log.ExportLogOptions(run=run, format=kind), QUIET)
     assert (run / "flight-000.ulg").read_bytes().startswith(b"ULog")
+
+
+@pytest.mark.parametrize("target", ["outside", "/dev/zero"])
+def test_a_linked_log_is_not_copied(target: str, run: Path, tmp_path: Path) -> None:
+    (tmp_path / "outside").write_bytes(CONTENT)
+    (run / "flight-000.ulg").symlink_to(tmp_path / target)
+    with pytest.raises(UsageError, match=r"flight-000\.ulg: a link out of its folder; accepted"):
+        export_log.run(export_log.ExportLogOptions(run=run, format="ulog", out=tmp_path), QUIET)
+    assert not (tmp_path / "flight-000.ulg").exists()
+
+
+@pytest.mark.parametrize("name", ["run.json", "episodes.jsonl", "latency.npz"])
+def test_links_out_of_a_run_are_not_read(name: str, run: Path, tmp_path: Path) -> None:
+    (run / name).rename(tmp_path / name)
+    (run / name).symlink_to(tmp_path / name)
+    with pytest.raises(UsageError, match=f"{name}: a link out of its folder"):
+        load(run)
+    (run / "kept").write_bytes((tmp_path / name).read_bytes())
+    (run / name).unlink()
+    (run / name).symlink_to(run / "kept")  # In the folder.
+    assert load(run).episodes
+
+
+def test_a_report_goes_elsewhere_on_request(run: Path, tmp_path: Path) -> None:
+    before = {path.name: path.stat().st_mtime_ns for path in run.iterdir()}
+    out = tmp_path / "pages"
+    options = report_command.ReportOptions(runs=(run,), figures=("svg",), out=out)
+    assert report_command.run(options, QUIET) == 0
+    assert {path.name: path.stat().st_mtime_ns for path in run.iterdir()} == before
+    names = {path.name for path in out.iterdir()}
+    assert {"report.html", "verdict.json", "latency.png", "latency-t2.svg"} <= names
+
+
+def test_a_planted_folder_does_not_stop_a_resumed_run(run: Path, outside: Path) -> None:
+    (run / "x.partial" / "y").mkdir(parents=True)
+    (run / "z.partial").symlink_to(outside)
+    folder, _ = RunFolder.resume(run)
+    folder.sweep()
+    assert not any(os.path.lexists(run / name) for name in ("x.partial", "z.partial"))
+    assert outside.exists()
 
 
 def test_a_picture_replaces_links(plant: Plant, tmp_path: Path) -> None:

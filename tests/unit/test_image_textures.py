@@ -198,7 +198,7 @@ def test_one_that_is_gone_or_has_changed_is_told_in_one_line(tmp_path: Path) -> 
     with pytest.raises(UsageError, match=r"appearance.materials: .*poster.png: No such file"):
         loaded(path)
     image.mkdir()
-    with pytest.raises(UsageError, match=r"poster.png: no file"):
+    with pytest.raises(UsageError, match=r"poster.png: Is a directory"):
         loaded(path)
 
 

@@ -14,9 +14,10 @@ from rich.console import Console
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.core import errors, fields, progress
 from airl_mav.core.constants import G_PER_KG, GRAVITY_M_S2, TICK_S
+from airl_mav.core.files import read_limited
 from airl_mav.envs import fleet, fleet_step, stopping
 from airl_mav.flight.energy import level_powers_w
-from airl_mav.profiles.loading import read_limited
+from airl_mav.profiles.loading import MOST_BYTES
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import CORNERS, Payload, VehicleProfile, equipped
 from airl_mav.report import document
@@ -217,7 +218,7 @@ def _fit_motor(profile: VehicleProfile, path: Path) -> tuple[VehicleProfile, Ben
 def _read_bench(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns of a bench table by name. Raises UsageError."""
     try:
-        text = read_limited(path, "a table").decode("utf-8-sig").rstrip()
+        text = read_limited(path, "a table", MOST_BYTES).decode("utf-8-sig").rstrip()
     except UnicodeDecodeError as error:
         raise errors.UsageError(f"{path}: not UTF-8 text: {error}") from None
     lines = [[cell.strip(' "\t') for cell in line.split(",")] for line in text.splitlines()]

@@ -42,6 +42,7 @@ class ExportDataOptions(fields.ProfileModel):
 
 
 OPTIONS = ExportDataOptions
+READS_FILES = True
 
 
 def run(options: ExportDataOptions, console: Console | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,7 +17,7 @@ from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.files import replacing
+from airl_mav.core.files import open_regular, replacing
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.rehearsal.run_folder import load, trust_arenas
 from airl_mav.scenario.aircraft import GREATEST_PORT
@@ -58,6 +59,7 @@ class ExportLogOptions(ProfileModel):
 
 
 OPTIONS = ExportLogOptions
+READS_FILES = True
 
 
 def run(options: ExportLogOptions, console: Console | None = None) -> int:
@@ -132,9 +134,10 @@ def write_flight(flight: recorded.RecordedFlight, run: Path, out: Path, kind: Fo
         write_mcap(flight, path)
         return path
     path, own = out / f"{name}{ULOG_SUFFIX}", run / f"{name}{ULOG_SUFFIX}"
-    if not own.exists():
+    if not os.path.lexists(own):
         ulog_log.write_ulog(flight, path)
     elif not (path.exists() and path.samefile(own)):
-        with replacing(path) as partial:
-            shutil.copyfile(own, partial)
+        source = open_regular(own, links=False)
+        with source, replacing(path) as partial, partial.open("wb") as copy:
+            shutil.copyfileobj(source, copy)
     return path

@@ -59,6 +59,7 @@ class IdentifyOptions(fields.ProfileModel):
 
 
 OPTIONS = IdentifyOptions
+READS_FILES = True
 
 SHORT = {
     "mass_kg": "mass",

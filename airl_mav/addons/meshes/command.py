@@ -62,6 +62,7 @@ class AssetOptions(fields.ProfileModel):
 
 
 OPTIONS = AssetOptions
+READS_FILES = True
 
 
 def run(options: AssetOptions, console: Console | None = None) -> int:

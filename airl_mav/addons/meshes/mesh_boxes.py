@@ -40,6 +40,9 @@ EDGE_SHARE = 0.5
 MOST_CUTS = 20
 """Maximum subdivisions of an edge."""
 
+MOST_PIECES = 500_000
+"""Maximum estimated number of subdivided triangles; the number is up to four times as large."""
+
 PATIENCE = 3
 """Consecutive sizes with too many boxes that end the search: finer cells mostly need more."""
 
@@ -120,6 +123,10 @@ def _finest(
     failed, share = 0, COARSEST
     while share >= FINEST and failed < PATIENCE:
         cell_m = share * side_m
+        sides = np.linalg.norm(np.diff(vertices[faces[:, [0, 1, 2, 0]]], axis=1), axis=2)
+        parts = np.maximum(sides.max(axis=1) / (EDGE_SHARE * cell_m), 1.0)
+        if np.square(parts).sum() > MOST_PIECES:
+            break
         # Subdivide the previous result; trimesh has no types for the function.
         vertices, faces = trimesh.remesh.subdivide_to_size(  # type: ignore[no-untyped-call]
             vertices, faces, EDGE_SHARE * cell_m, max_iter=MOST_CUTS

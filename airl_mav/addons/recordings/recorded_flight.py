@@ -221,7 +221,7 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     """Return the run folder of a black box and its vehicle's log, created beside it if missing."""
     box = mcap_file.read_black_box(path)
     folder = files.subfolder(path.parent, path.stem + ("" if ulg is None else WITH_LOG))
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = files.sha256_of(path)
     if ulg is not None:
         # Imported here: pyulog is an extra.
         from airl_mav.vehicle_log import read_vehicle_log
