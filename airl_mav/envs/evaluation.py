@@ -121,7 +121,7 @@ class LearnedPilots:
 def _each(
     flying: NDArray[np.bool_], act: Callable[[int], Any], chosen: NDArray[np.float64]
 ) -> dict[int, str]:
-    """Store the command of each flying vehicle; return the reasons of those whose policy failed."""
+    """Store the command of each flying vehicle; return the failures of policies by vehicle."""
     failed = {}
     for i in np.flatnonzero(flying).tolist():
         try:

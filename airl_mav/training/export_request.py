@@ -223,7 +223,7 @@ class ExportRequest(BaseModel):
     with_torch: bool = switch("also write policy.pt2, for the torch runtime")
     trust: Annotated[bool, COMMON] = switch(
         "unpickle a .zip and its VecNormalize, or run code that a policy's card names: all execute"
-        " what their author wrote"
+        " code of their author"
     )
     int8: Annotated[bool, COMMON] = switch(
         "write a network in 8-bit integers, calibrated with frames of its own flights"

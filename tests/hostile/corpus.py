@@ -1119,8 +1119,8 @@ def meshes() -> Iterator[tuple[str, tuple[str, ...], Build]]:
     for what, (name, data) in {
         "stl count": ("m.stl", bytes(80) + struct.pack("<I", 2**32 - 1)),
         "stl count, few bytes": ("m.stl", bytes(80) + struct.pack("<I", 10**6) + bytes(50)),
-        "stl NaN": ("m.stl", stl([corner * np.nan])),
-        "stl infinite": ("m.stl", stl([corner * np.inf])),
+        "stl NaN": ("m.stl", stl([np.full_like(corner, np.nan)])),
+        "stl infinite": ("m.stl", stl([np.full_like(corner, np.inf)])),
         "stl 1e38": ("m.stl", stl([corner * 1e38])),
         "stl flat": ("m.stl", stl([corner * 0.0])),
         "stl 10,000 large triangles": ("m.stl", stl(np.tile(corner[None] * 19.0, (10_000, 1, 1)))),

@@ -56,7 +56,8 @@ def preloaded() -> None:
         for name, each in ENTRIES.items()
     ],
 )
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(300)
+@pytest.mark.filterwarnings("ignore:.*fork")
 def test_a_hostile_input_is_refused_in_one_line_or_read(entry: Entry, tmp_path: Path) -> None:
     result = read(entry, tmp_path)
     assert not result.problems, result.row()
