@@ -29,7 +29,6 @@ SAMPLE = {
     "export: flight-000.ulg is secret",
     "export: flight-000.ulg is FIFO",
     "export: escapes in texts",
-    "resume: folder x.partial",
     "policy: model is nested groups",
     "policy: torch program is a pickle",
     "export: pickled model",
