@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.report.comparison.comparison_model import SCHEMA as COMPARISON
 from tests.hostile.reading import MARKUP, SCRIPT, Entry, Result, preload, read
 from tests.support import hostile_policies
 from tests.support.run_demo import write_demo_run
@@ -254,7 +255,7 @@ def comparison(**fields: Any) -> Build:
         for name in ("a", "b"):
             shutil.copytree(_base() / "run", folder / name)
         data: dict[str, Any] = {
-            "schema": 2,
+            "schema": COMPARISON,
             "kind": "compare",
             "title": "t",
             "runs": [{"name": "a", "folder": "a"}, {"name": "b", "folder": "b"}],
@@ -506,7 +507,7 @@ def runs() -> Iterator[tuple[str, tuple[str, ...], Build]]:
             f"comparison: {name} of other types",
             ("report", "{d}"),
             lambda folder, name=name: (folder / f"{name}.json").write_text(
-                '{"schema": 2, "runs": 7}'
+                f'{{"schema": {COMPARISON}, "runs": 7}}'
             ),
         )
 
