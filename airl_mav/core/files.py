@@ -289,7 +289,7 @@ def _append(file: IO[bytes], data: bytes) -> None:
     before = file.seek(0, os.SEEK_END)
     view = memoryview(data)
     try:
-        # Unbuffered: what failed must not be written when the file is closed.
+        # Unbuffered: a failed write must not be repeated when the file is closed.
         while view:
             view = view[os.write(file.fileno(), view) :]
         os.fsync(file.fileno())

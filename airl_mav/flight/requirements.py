@@ -188,7 +188,7 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
 def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
     """Return a finding for flights added until a minimum success rate was decided.
 
-    Repeated looks make the interval's error exceed its nominal 5 %. The estimate is that of the
+    Repeated looks make the interval's error exceed its nominal 5 %. The estimate is the one of the
     deciding look, with an interval that holds at its stop. `reached` are the flights in the order
     of their seeds. Findings of other requirements stay.
     """

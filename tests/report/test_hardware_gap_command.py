@@ -566,8 +566,8 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
 
 
 def test_a_named_computer_is_flown_whole_and_its_latency_alone(tmp_path: Path) -> None:
-    options = {"latency": "150ms", "computer": "ras-pi-4", "episodes": 2}
-    assert measure("none", out=tmp_path / "out", **options)[0] == 0
+    out = tmp_path / "out"
+    assert measure("none", out=out, latency="150ms", computer="ras-pi-4", episodes=2)[0] == 0
     columns = {c["role"]: c["setup"] for c in columns_of(data_of(tmp_path / "out"))}
     assert list(columns) == list(NOT_RETRAINED)
     assert columns["target"]["computer_watts"] == 1.7

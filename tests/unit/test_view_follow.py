@@ -40,7 +40,7 @@ def shown(north_m: float) -> Shown:
 def watched() -> Any:
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     page, watchers = Page(), Watchers(server)
-    server.get_clients = lambda: {7: page}  # type: ignore[method-assign,assignment]
+    server.get_clients = lambda: {7: page}  # type: ignore[method-assign,dict-item]
     watchers._following[7] = SimpleNamespace(value=True)
     yield watchers, page
     server.stop()
