@@ -3,6 +3,9 @@
 A learned policy acts on any input: with a frozen position it overshoots the goal, with a frozen
 image it hits obstacles. The first broken rule ends the flight (`offboard_mission`). The bounds
 are wide; sensor quality is the estimator's task.
+
+Position, velocity, attitude and body rates must agree with each other and with gravity. This finds
+a single false value, and no error that all of them share (`scripts/telemetry_lies.py`).
 """
 
 from __future__ import annotations
@@ -14,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Goal, goal_height_m
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.frames import Goal, goal_height_m, quat_yaw, wrap_pi
+from airl_mav.policy.actions import KINDS
 from airl_mav.policy.observation import Kinematics
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.frame_source import ReceivedFrame
@@ -45,19 +49,49 @@ REASONS = (
 MODE_KNOWN_S = 3.0
 """Maximum latency of the report of a mode change [s]: three heartbeats of 1 Hz."""
 
-STEP_M = 5.0
-"""Maximum position jump beyond the distance explained by velocity [m]; larger than the resets of an
-estimator that regains GPS within its gates."""
-
-DRIFT_M = 8.0
-"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m]."""
+DRIFT_M, SPAN_M = 1.0, 2.0
+"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m]. It grows with
+the time between two checks, up to `SPAN_M`. A velocity that changes by 1 g and back leaves
+g dt^2 / 4. Honest flights: 0.4 m at 2 Hz, 2.8 m at 1 Hz."""
 
 DRIFT_S = 5.0
+
+HEADING_RAD, HEADING_RAD_S = math.radians(15.0), math.radians(80.0)
+"""Maximum difference of heading and integrated yaw rate, leaking with `SWAY_S` [rad]. It grows
+with the time between two checks [rad/s]. Honest flights: 2 deg at 30 Hz, 46 deg at 2 Hz."""
+
+PUSH_M_S, PUSH_M_S2 = 10.0, 7.0
+"""Maximum difference of level velocity and integrated thrust, leaking with `SWAY_S` [m/s]. It grows
+with the time between two checks [m/s2]. Drag in 8 m/s of wind leaves 5 m/s."""
+
+SWAY_S = 2.0
+
+STEEP = 0.25
+"""Minimum cosine of the tilt for tan(tilt)."""
+
+UNWATCHED_S = 2.0
+"""Time between two checks after which the sums begin again [s]. Lockstep skips the take-off."""
+
+TURN_RAD_S = 4.0 * math.pi
+"""Maximum body rate [rad/s]: three times PX4's limit (MC_ROLLRATE_MAX 220 deg/s)."""
+
+TAKEOFF_M, TAKEOFF_RAD = 2.0, math.radians(45.0)
+"""Maximum level shift of a take-off, and error of its climb [m]; maximum turn [rad]. Honest
+flights in 8 m/s of wind: 0.4 m, 1 deg."""
+
+ORIGIN_M = 5.0
+"""Maximum difference of the height after the take-off from the flight altitude [m]."""
+
+CLOCK_S = 30.0
+"""Time constant of the vehicle's clock relative to the companion's [s]."""
 
 SPEEDS = 3.0
 """Maximum velocity as a multiple of the fastest action, plus `SPEED_M_S`: wind, overshoot."""
 
 SPEED_M_S = 10.0
+
+FREE_M_S = 50.0
+"""Maximum velocity of a policy without a speed limit [m/s]: it commands attitudes or body rates."""
 
 NORM = 0.1
 """Maximum deviation of an attitude quaternion's norm from 1."""
@@ -66,7 +100,12 @@ CLEARANCE_M = 50.0
 """Margin for detours in the default radius, which is twice the goal's distance plus this [m]."""
 
 CLIMB_M = 10.0
-"""Margin of the default height limit above the flight altitude and the goal's height [m]."""
+"""Margin of the height limits [m]. The upper one is above the flight altitude and the goal, the
+lower one below the start and the goal."""
+
+SLOW, FLIGHT_S = 10.0, 120.0
+"""Default time limit: multiple of the time straight to the goal at the maximum speed, and a
+constant [s]."""
 
 OWN_CLOCK_S = 1.0
 """Maximum age of a first frame stamped by this clock [s]; else ages count from its arrival."""
@@ -80,6 +119,25 @@ GRAZING_RAD = math.radians(10.0)
 
 TOLD = ("position", "velocity", "attitude")
 """Checked telemetry of the vehicle, in the order of `Kinematics`."""
+
+NUMBERS = (
+    *("north position", "east position", "height", "north velocity", "east velocity"),
+    *("vertical velocity", "attitude", "heading", "roll rate", "pitch rate", "yaw rate"),
+)
+"""Numbers that change with every report. The heading is rounded: the attitude's other angles change
+its last digits."""
+
+HEADING_DIGITS = 5
+
+
+def with_time_limit(
+    settings: LimitSettings, goal: Goal, pilot: PilotSettings, least_s: float = 0.0
+) -> LimitSettings:
+    """Return settings with a time limit. The default is at least `least_s` [s]."""
+    if settings.flight_s is not None:
+        return settings
+    flight_s = FLIGHT_S + SLOW * math.hypot(*goal[:2]) / pilot.max_speed_m_s
+    return settings.model_copy(update={"flight_s": max(least_s, flight_s)})
 
 
 class Ending(NamedTuple):
@@ -124,6 +182,12 @@ class Limits:
         self._vehicle = VehicleLimits(settings, goal, pilot)
         self._camera = CameraLimits(settings, mount_rad)
 
+    def watch(self, state: Kinematics, now_us: int) -> Ending | None:
+        """Return the rule that telemetry breaks before the navigation, at `now_us` [µs]."""
+        if self.ending is None:
+            self.ending = self._vehicle.watch(state, now_us)
+        return self.ending
+
     def begin(self, now_us: int) -> None:
         """Start navigation at `now_us` [µs]."""
         self._vehicle.begun_us = now_us
@@ -164,13 +228,18 @@ class VehicleLimits:
         highest_m = max(pilot.altitude_m, goal_height_m(goal) or 0.0)
         self.height_m = highest_m + CLIMB_M if height_m is None else height_m
         """Maximum height above the start [m]."""
-        self._flight_s = settings.flight_s
+        self._depth_m = CLIMB_M - min(0.0, goal_height_m(goal) or 0.0)
+        self._altitude_m = pilot.altitude_m
+        self._flight_s = with_time_limit(settings, goal, pilot).flight_s
         self._battery = settings.battery
-        self._fastest_m_s = SPEEDS * pilot.max_speed_m_s + SPEED_M_S
+        steady = KINDS[pilot.commands].steady
+        self._fastest_m_s = SPEEDS * pilot.max_speed_m_s + SPEED_M_S if steady else FREE_M_S
         self._offboard = self._armed = False
         self._unchanged = [_Unchanged() for _ in TOLD]
-        self._before: tuple[Kinematics, int] | None = None
-        self._drift_m = np.zeros(2)
+        self._motion = MotionMonitor(self._silence_us // 2)
+        self._stamp_us: int | None = None
+        self._usual_us = 0
+        self._rest: Kinematics | None = None
 
     def not_ours(self, status: VehicleStatus, now_us: int) -> Ending | None:
         """Return the reason if the companion must stop commanding; None = it has control."""
@@ -185,8 +254,23 @@ class VehicleLimits:
             return Ending(TAKEN_OVER, f"the mode is {status.mode}")
         return None
 
+    def watch(self, state: Kinematics, now_us: int) -> Ending | None:
+        """Return the rule that telemetry breaks before the navigation; None = plausible."""
+        ending = self._implausible(state, now_us)
+        self._rest = self._rest or state
+        return ending
+
     def broken(self, status: VehicleStatus, state: Kinematics, now_us: int) -> Ending | None:
         """Return the rule that telemetry breaks; None = telemetry is plausible."""
+        # The order decides the reported reason.
+        return (
+            self._implausible(state, now_us)
+            or self._taken_off(state)
+            or self._outside(state, now_us)
+            or self._drained(status)
+        )
+
+    def _implausible(self, state: Kinematics, now_us: int) -> Ending | None:
         # Frozen telemetry is bit-identical; a real estimator always has noise.
         values = (state.position, state.velocity, state.quaternion)
         for name, unchanged, value in zip(TOLD, self._unchanged, values, strict=True):
@@ -198,17 +282,53 @@ class VehicleLimits:
                     TELEMETRY_FROZEN, f"{name} has not changed for {silent_us / US_PER_S:.1f} s"
                 )
         # A wrong quaternion would turn every velocity command.
-        norm = float(np.linalg.norm(state.quaternion))
+        norm = math.hypot(*state.quaternion)
         if abs(norm - 1.0) > NORM:
             return Ending(TELEMETRY_WRONG, f"the attitude quaternion has norm {norm:.2f}")
-        speed = float(np.linalg.norm(state.velocity))
+        speed = math.hypot(*state.velocity)
         if speed > self._fastest_m_s:
             return Ending(
                 TELEMETRY_WRONG,
                 f"velocity {speed:.1f} m/s; believed: up to {self._fastest_m_s:g} m/s",
             )
-        # The order decides the reported reason.
-        return self._moved(state, now_us) or self._outside(state, now_us) or self._drained(status)
+        wrong = self._late(state.time_us, now_us) or self._motion.contradiction(state, now_us)
+        return None if wrong is None else Ending(TELEMETRY_WRONG, wrong)
+
+    def _late(self, stamp_us: int | None, now_us: int) -> str | None:
+        """Return the change of telemetry's latency, as text, if it is too large."""
+        # Without a new stamp, telemetry pauses: if it lasts, telemetry is frozen.
+        if stamp_us is None or stamp_us == self._stamp_us:
+            return None
+        last_us, self._stamp_us, behind_us = self._stamp_us, stamp_us, now_us - stamp_us
+        if last_us is None:
+            self._usual_us = behind_us
+        changed_us = behind_us - self._usual_us
+        if abs(changed_us) > self._silence_us // 2:
+            return f"its time stamps have moved by {-changed_us / US_PER_S:+.1f} s"
+        # The two clocks may drift, and a simulated one may be slow.
+        share = 1.0 if last_us is None else (stamp_us - last_us) / (CLOCK_S * US_PER_S)
+        self._usual_us += round(min(1.0, max(0.0, share)) * changed_us)
+        return None
+
+    def _taken_off(self, state: Kinematics) -> Ending | None:
+        """Return the rule that the take-off breaks; it is vertical, and seldom watched."""
+        rest, self._rest = self._rest, None
+        if rest is None:
+            return None
+        north_m, east_m, down_m = (state.position - rest.position).tolist()
+        turn_rad = wrap_pi(quat_yaw(state.quaternion) - quat_yaw(rest.quaternion))
+        asked, height_m = f"the take-off to {self._altitude_m:g} m", -float(state.position[2])
+        if (shift_m := math.hypot(north_m, east_m)) > TAKEOFF_M:
+            return Ending(TELEMETRY_WRONG, f"{asked} moved the position by {shift_m:.1f} m")
+        if abs(-down_m - self._altitude_m) > TAKEOFF_M:
+            return Ending(TELEMETRY_WRONG, f"{asked} changed the height by {-down_m:.1f} m")
+        if abs(height_m - self._altitude_m) > ORIGIN_M:
+            return Ending(TELEMETRY_WRONG, f"{asked} ended at a height of {height_m:.1f} m")
+        if abs(turn_rad) > TAKEOFF_RAD:
+            return Ending(
+                TELEMETRY_WRONG, f"{asked} turned the nose by {math.degrees(turn_rad):.0f} deg"
+            )
+        return None
 
     def _drained(self, status: VehicleStatus) -> Ending | None:
         if self._battery is None:
@@ -220,30 +340,6 @@ class VehicleLimits:
             return Ending(
                 BATTERY_LOW, f"{100.0 * status.battery:.0f} %; at least {100.0 * self._battery:g} %"
             )
-        return None
-
-    def _moved(self, state: Kinematics, now_us: int) -> Ending | None:
-        if self._before is None:
-            self._before = state, now_us
-            return None
-        last, last_us = self._before
-        if (state.position == last.position).all() and (state.velocity == last.velocity).all():
-            return None  # without new telemetry; frozen telemetry is detected elsewhere
-        self._before = state, now_us
-        dt_s = (now_us - last_us) / US_PER_S
-        # Trapezoidal integral of velocity between the two samples.
-        explained = 0.5 * (last.velocity + state.velocity) * dt_s
-        rest = (state.position - last.position - explained)[:2]
-        jump_m = float(np.linalg.norm(rest))
-        # A vehicle may brake and turn between two checks, which leaves half its speed unexplained.
-        speeds = np.linalg.norm(last.velocity), np.linalg.norm(state.velocity)
-        if jump_m > STEP_M + max(speeds) * dt_s:
-            return Ending(TELEMETRY_WRONG, f"the position jumped by {jump_m:.1f} m")
-        # Leaky sum of unexplained motion: a slow drift adds up, single errors decay.
-        self._drift_m = self._drift_m * math.exp(-dt_s / DRIFT_S) + rest
-        drift_m = float(np.linalg.norm(self._drift_m))
-        if drift_m > DRIFT_M:
-            return Ending(TELEMETRY_WRONG, f"position and velocity have parted by {drift_m:.1f} m")
         return None
 
     def _outside(self, state: Kinematics, now_us: int) -> Ending | None:
@@ -258,10 +354,155 @@ class VehicleLimits:
             return Ending(
                 OUT_OF_BOUNDS, f"{-down:.1f} m above the start; at most {self.height_m:g} m"
             )
+        if down > self._depth_m:
+            return Ending(
+                OUT_OF_BOUNDS, f"{down:.1f} m below the start; at most {self._depth_m:g} m"
+            )
         flown_s = (now_us - self.begun_us) / US_PER_S
         if self._flight_s is not None and flown_s > self._flight_s:
             return Ending(OUT_OF_TIME, f"{flown_s:.0f} s; at most {self._flight_s:g} s")
         return None
+
+
+class _Sample(NamedTuple):
+    """Motion at a check."""
+
+    now_us: int
+    numbers: tuple[Any, ...]
+    """Values of `NUMBERS`, without rates that are not reported."""
+    yaw_rad: float
+    yaw_rate_rad_s: float
+    lean: tuple[float, float]
+    """Level thrust, north and east, as a share of its upward part: tan(tilt)."""
+    upright: float
+    """Cosine of the tilt."""
+
+
+class MotionMonitor:
+    """Consistency of position, velocity, attitude and body rates over time, and with gravity."""
+
+    def __init__(self, frozen_us: int) -> None:
+        """Set the maximum time for which one number may stay the same [µs]."""
+        self._frozen_us = frozen_us
+        self._last: _Sample | None = None
+        self._numbers: tuple[Any, ...] = ()
+        self._changed_us: list[int] = []
+        self._forget()
+        self._rates = False
+        """True once body rates were reported."""
+
+    def _forget(self) -> None:
+        self._drift_m = [0.0, 0.0, 0.0]
+        self._turn_rad = 0.0
+        self._push_m_s = [0.0, 0.0]
+        self._behind = False
+        """True if the last position may have been old."""
+
+    def contradiction(self, state: Kinematics, now_us: int) -> str | None:
+        """Return the contradiction in finite telemetry, as text; None = consistent."""
+        now = self._sample(state, now_us)
+        if isinstance(now, str):
+            return now
+        if (frozen := self._frozen(now)) is not None:
+            return frozen
+        last = self._last
+        # A pause is no contradiction; frozen telemetry is detected elsewhere.
+        if last is not None and now.numbers[:6] == last.numbers[:6]:
+            return None
+        self._last = now
+        return None if last is None else self._parted(last, now)
+
+    def _sample(self, state: Kinematics, now_us: int) -> _Sample | str:
+        """Return a sample, or its contradiction as text."""
+        w, x, y, z = quaternion = tuple(state.quaternion.tolist())
+        rates = () if state.rates is None else tuple(state.rates.tolist())
+        # Not every flight controller reports body rates: they are NaN then.
+        if not all(map(math.isfinite, rates)):
+            rates = ()
+        if self._rates and not rates:
+            return "a body rate is not finite"
+        self._rates = bool(rates)
+        fastest = max(map(abs, rates), default=0.0)
+        if fastest > TURN_RAD_S:
+            return f"a body rate of {fastest:.1f} rad/s; believed: up to {TURN_RAD_S:.1f} rad/s"
+        # Third column of the rotation: the body's down axis in NED.
+        north, east = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
+        down = 1.0 - 2.0 * (x * x + y * y)
+        if down < 0.0:
+            return "the vehicle is upside down"
+        yaw, yaw_rate = quat_yaw(state.quaternion), math.nan
+        if rates:
+            # Rate of the Euler angle: (q sin(roll) + r cos(roll)) / cos(pitch).
+            level = max(STEEP**2, 1.0 - 4.0 * (w * y - z * x) ** 2)
+            yaw_rate = (2.0 * (y * z + w * x) * rates[1] + down * rates[2]) / level
+        lean = -1.0 / max(STEEP, down)
+        angles = quaternion, round(yaw, HEADING_DIGITS)
+        numbers = (*state.position.tolist(), *state.velocity.tolist(), *angles, *rates)
+        return _Sample(now_us, numbers, yaw, yaw_rate, (lean * north, lean * east), down)
+
+    def _frozen(self, now: _Sample) -> str | None:
+        """Return the number that stays the same while another one changes."""
+        before, self._numbers = self._numbers, now.numbers
+        if len(before) != len(now.numbers):
+            self._changed_us = [now.now_us] * len(now.numbers)
+        frozen = None
+        for k, (old, new) in enumerate(zip(before, now.numbers, strict=False)):
+            if new != old:
+                self._changed_us[k] = now.now_us
+            elif frozen is None and now.now_us - self._changed_us[k] > self._frozen_us:
+                silent_s = (now.now_us - self._changed_us[k]) / US_PER_S
+                frozen = f"only the {NUMBERS[k]} has not changed for {silent_s:.1f} s"
+        return frozen if now.now_us in self._changed_us else None
+
+    def _parted(self, last: _Sample, now: _Sample) -> str | None:
+        """Return the values that have parted since the last sample.
+
+        The sums are leaky: a slow drift adds up, single errors decay.
+        """
+        dt_s = (now.now_us - last.now_us) / US_PER_S
+        if dt_s > UNWATCHED_S:
+            self._forget()
+            return None
+        mean_s, leak, sway_leak = 0.5 * dt_s, math.exp(-dt_s / DRIFT_S), math.exp(-dt_s / SWAY_S)
+        drift_m, push_m_s, a, b = self._drift_m, self._push_m_s, last.numbers, now.numbers
+        # Trapezoidal integral of velocity between the two samples.
+        for k in range(3):
+            rest_m = b[k] - a[k] - mean_s * (a[3 + k] + b[3 + k])
+            drift_m[k] = leak * drift_m[k] + rest_m
+        parted_m = math.hypot(*drift_m)
+        bound_m = DRIFT_M + min(SPAN_M, 0.25 * GRAVITY_M_S2 * dt_s**2)
+        behind, self._behind = self._behind, parted_m > bound_m
+        # After a pause of the link the position is old. The next one decides.
+        if parted_m > bound_m and (behind or _beside_m(drift_m, b[3:6], dt_s) > bound_m):
+            return f"position and velocity have parted by {parted_m:.1f} m"
+        if math.isfinite(last.yaw_rate_rad_s + now.yaw_rate_rad_s):
+            turned = mean_s * (last.yaw_rate_rad_s + now.yaw_rate_rad_s)
+            # A steep vehicle has no heading.
+            weight = min(last.upright, now.upright) ** 2
+            self._turn_rad *= sway_leak
+            self._turn_rad += weight * wrap_pi(now.yaw_rad - last.yaw_rad - turned)
+            if abs(self._turn_rad) > HEADING_RAD + HEADING_RAD_S * dt_s:
+                parted_deg = math.degrees(abs(self._turn_rad))
+                return f"heading and yaw rate have parted by {parted_deg:.0f} deg"
+        # The thrust along the body's up axis carries the weight and the vertical acceleration.
+        up_m_s = 0.5 * (GRAVITY_M_S2 * dt_s - (b[5] - a[5]))
+        for k in range(2):
+            rest_m_s = b[3 + k] - a[3 + k] - up_m_s * (last.lean[k] + now.lean[k])
+            push_m_s[k] = sway_leak * push_m_s[k] + rest_m_s
+        pushed_m_s = math.hypot(*push_m_s)
+        if pushed_m_s > PUSH_M_S + PUSH_M_S2 * dt_s:
+            return f"velocity and tilt have parted by {pushed_m_s:.1f} m/s"
+        return None
+
+
+def _beside_m(drift_m: list[float], velocity: tuple[float, ...], dt_s: float) -> float:
+    """Return the part of a drift that no position of the last `dt_s` explains [m]."""
+    speed = math.hypot(*velocity)
+    if speed == 0.0:
+        return math.hypot(*drift_m)
+    behind_m = -sum(d * v for d, v in zip(drift_m, velocity, strict=True)) / speed
+    share = min(max(0.0, behind_m), speed * dt_s) / speed
+    return math.hypot(*(d + share * v for d, v in zip(drift_m, velocity, strict=True)))
 
 
 class CameraLimits:

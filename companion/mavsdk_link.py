@@ -8,7 +8,7 @@ import struct
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from mavsdk import ComponentType
@@ -51,6 +51,8 @@ STREAM_TIMEOUT_S = 10.0
 
 STREAM_RETRY_S = 0.2
 """Interval of requests for a stream [wall s]."""
+
+Watch: TypeAlias = "Callable[[observation.Kinematics], None]"
 
 _HEADER = 10
 """Length of a MAVLink 2 header [bytes]."""
@@ -277,6 +279,7 @@ class MavsdkLink:
             np.array([v.north_m_s, v.east_m_s, v.down_m_s]),
             np.array([q.w, q.x, q.y, q.z]),
             np.array([w.roll_rad_s, w.pitch_rad_s, w.yaw_rad_s]),
+            int(q.timestamp_us) or None,
         )
 
     def status(self) -> link_interface.VehicleStatus:
@@ -308,12 +311,14 @@ class MavsdkLink:
         timeout_s: float,
         stop: threading.Event,
         origin: tuple[float, float, float] | None = None,
+        watch: Watch = lambda _: None,
     ) -> None:
         """Wait until the flight controller reports good health, then arm; `stop` ends the wait.
 
         After a reboot, a health report may be out of date. Health must be good for
         `HEALTH_SETTLE_S`, and a rejected request is repeated. `origin` (latitude, longitude [deg],
-        altitude [m]) is sent to a flight controller without a position.
+        altitude [m]) is sent to a flight controller without a position. `watch` receives the
+        telemetry of good health and may raise LinkError.
         """
         # The timeout covers health and arming together.
         deadline_us = self._deadline(timeout_s)
@@ -332,6 +337,8 @@ class MavsdkLink:
                 tell_us = self._tell_origin(origin, tell_us)
             if missing:
                 good_since_us = self._clock.time_us()
+            else:
+                watch(self.kinematics())
         self.check_alone()
         while True:
             try:
@@ -350,8 +357,17 @@ class MavsdkLink:
         self._call("origin", lambda: self._action.set_gps_global_origin(*origin))
         return now_us + int(ORIGIN_RETRY_S * constants.US_PER_S)
 
-    def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
-        """Take off and wait until an altitude above the start is reached, or `stop` is set."""
+    def takeoff(
+        self,
+        altitude_m: float,
+        timeout_s: float,
+        stop: threading.Event,
+        watch: Watch = lambda _: None,
+    ) -> None:
+        """Take off and wait until an altitude above the start is reached, or `stop` is set.
+
+        `watch` receives telemetry and may raise LinkError.
+        """
         # Height counts from the start, since the local origin need not be at the ground.
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
@@ -379,7 +395,7 @@ class MavsdkLink:
             return 0.0 if math.isnan(left_m) else least_s * constants.US_PER_S
 
         while True:
-            state = self.kinematics()
+            watch(state := self.kinematics())
             height, speed = start_down - float(state.position[2]), abs(float(state.velocity[2]))
             # Height and speed must both settle before offboard.
             if height > least_m and speed < constants.TAKEOFF_REACHED_M_S:

@@ -32,7 +32,7 @@ from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.scenario import model, stand_alone
 from companion import link_interface
 from companion.frame_source import FrameSource, ReceivedFrame
-from companion.limits import NOT_OURS, Limits
+from companion.limits import NOT_OURS, Limits, with_time_limit
 from companion.mavsdk_connection import ARDUPILOT
 from companion.mavsdk_link import MavsdkLink
 from companion.watchdog import Guard, Watchdog
@@ -271,6 +271,9 @@ HOVER_TIMEOUT_S = 5.0
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
 
+REFEREE_S = 10.0
+"""Time from a rehearsal's time limit to the companion's [s]: the referee's order may be late."""
+
 FRAME_TIMEOUT_S = 5.0
 """Timeout of the first camera frame [wall s]."""
 
@@ -325,16 +328,18 @@ class Mission:
         compensator: Compensator | None,
     ) -> Mission:
         """Return the mission of a scenario to a goal."""
+        asked, pilot = scenario.scenario, scenario.companion_pilot
         return cls(
             goal,
             policy,
-            scenario.companion_pilot,
+            pilot,
             scenario.watchdog,
-            scenario.scenario.limits,
+            # The referee's time limit comes first.
+            with_time_limit(asked.limits, goal, pilot, asked.time_limit_s + REFEREE_S),
             latency,
             compensator,
             mount_of(scenario.vehicle),
-            start="hover" if scenario.scenario.start == "hover" else "arm",
+            start="hover" if asked.start == "hover" else "arm",
         )
 
 
@@ -377,7 +382,7 @@ def fly_mission(
     )
     # From here on the vehicle may fly: every way out passes through the landing below.
     try:
-        _begin(link, start, settings, stop, progress)
+        _begin(link, start, settings, stop, progress, limits, clock)
         progress("navigating")
         # The watchdog starts before its guard, so that the first deadline counts from here.
         watchdog.begin()
@@ -442,8 +447,15 @@ def _begin(
     settings: model.PilotSettings,
     stop: threading.Event,
     progress: Callable[[str], None],
+    limits: Limits,
+    clock: Clock,
 ) -> None:
     """Wait until the vehicle flies the companion's setpoints. Raises LinkError."""
+
+    def watch(state: Kinematics) -> None:
+        if (ending := limits.watch(state, clock.time_us())) is not None:
+            raise link_interface.LinkError(ending.reason)
+
     progress(FIRST_PHASE[start])
     link.prepare(PREPARE_TIMEOUT_S, stop)
     # Checked after `prepare`, which detects the kind of flight controller.
@@ -461,9 +473,9 @@ def _begin(
         link.await_hover(settings.altitude_m, HOVER_TIMEOUT_S, stop)
         link.enter_offboard()
         return
-    link.arm(link.dialect.arm_timeout_s, stop, settings.origin)
+    link.arm(link.dialect.arm_timeout_s, stop, settings.origin, watch)
     progress("taking off")
-    link.takeoff(settings.altitude_m, TAKEOFF_TIMEOUT_S, stop)
+    link.takeoff(settings.altitude_m, TAKEOFF_TIMEOUT_S, stop, watch)
     link.enter_offboard()
 
 

@@ -25,18 +25,14 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.projections import PROJECTIONS
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario import checks, model, stand_alone
-from companion import frame_source, pilot
+from companion import frame_source, limits, pilot
 from companion.link_interface import LinkError
 from companion.mavsdk_connection import RATE_HZ
 from companion.mavsdk_link import MavsdkLink
-from companion.pilot import age_of
 from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:
     from companion.addons.black_box.recorder import BlackBoxRecorder
-
-FLIGHT_S = 600.0
-"""Default time limit of navigation [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,10 +81,6 @@ def prepare(asked: stand_alone.StandAloneCompanion) -> MissionSetup:
     checks.check_compensated(settings, policy, vehicle)
     if settings.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
-    limits = asked.limits
-    # A stand-alone flight always has a time limit.
-    if limits.flight_s is None:
-        limits = limits.model_copy(update={"flight_s": FLIGHT_S})
     computer = Part(asked.computer, load_computer(asked.computer).description)
     # Without injection the inference runs at this computer's speed.
     if injection.latency is None:
@@ -111,7 +103,7 @@ def prepare(asked: stand_alone.StandAloneCompanion) -> MissionSetup:
         policy=loaded,
         pilot=settings,
         watchdog=watchdog,
-        limits=limits,
+        limits=limits.with_time_limit(asked.limits, asked.goal, settings),
         latency=sampler,
         compensator=compensator,
         mount_rad=pilot.mount_of(vehicle),
@@ -311,7 +303,7 @@ def look_at_camera(
             # Equality with the first frame throughout means a frozen image.
             frozen = frozen and np.array_equal(first.frame.image, newer.frame.image)
             last = newer
-            ages_us.append(age_of(newer, clock.time_us()))
+            ages_us.append(pilot.age_of(newer, clock.time_us()))
     lens, rate_hz = first.frame.intrinsics, len(ages_us) / LOOK_S
     if not ages_us:
         yield CheckResult("camera", False, f"one frame in {LOOK_S:g} s")

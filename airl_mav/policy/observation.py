@@ -30,6 +30,8 @@ class Kinematics:
     velocity: Vector  # (..., 3) NED [m/s]
     quaternion: Vector  # (..., 4) body FRD -> NED
     rates: Vector | None = None  # (..., 3) body FRD [rad/s]; None = not reported
+    time_us: int | None = None
+    """Time of one vehicle's attitude by the vehicle's clock [µs]; None = not reported."""
 
     def known(self) -> dict[str, Vector]:
         """Return position, velocity and quaternion by name: the fields that are always present."""

@@ -136,14 +136,15 @@ class LimitSettings(ProfileModel):
         default=None,
     )
     height_m: float | None = quantity(
-        "maximum height above the start; by default 10 m above the flight altitude",
+        "maximum height above the start; by default 10 m above the flight altitude and the goal",
         "m",
         gt=0,
         le=1000,
         default=None,
     )
     flight_s: float | None = quantity(
-        "maximum navigation time; by default ten minutes, in a rehearsal its time limit",
+        "maximum navigation time; by default 120 s and ten times the time straight to the goal,"
+        " in a rehearsal at least 10 s more than its time limit",
         "s",
         ge=1,
         le=36_000,

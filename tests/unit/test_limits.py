@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.frames import quat_from_euler, quat_to_euler
+from airl_mav.policy.actions import CommandKind
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.scenario.model import LimitSettings, PilotSettings
@@ -35,12 +37,14 @@ from companion.limits import (
     Limits,
     VehicleLimits,
     ground_in_view,
+    with_time_limit,
 )
 from companion.link_interface import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
 
 LENS = Intrinsics.from_fov(8, 6, math.radians(90.0))
 OURS = VehicleStatus(armed=True, offboard=True, mode="offboard")
 SPEED_M_S, RADIUS_M, HEIGHT_M = 4.0, 10.0, 2.5
+BANK_RAD = math.atan(SPEED_M_S**2 / RADIUS_M / GRAVITY_M_S2)
 GOAL = (25.0, 0.0)
 PILOT = PilotSettings(altitude_m=HEIGHT_M)
 PERIODS_S = (0.1, 0.5, 1.5)
@@ -56,7 +60,7 @@ class Told:
     received_us: int
     status: VehicleStatus = OURS
 
-    def moved(self, **changes: np.ndarray) -> Told:
+    def moved(self, **changes: Any) -> Told:
         return replace(self, state=replace(self.state, **changes))
 
     def seen(self, **changes: Any) -> Told:
@@ -64,17 +68,36 @@ class Told:
 
 
 def honest(t_s: float) -> Told:
-    """Return correct data: a circle to the right at 4 m/s, and images over level ground."""
-    angle = SPEED_M_S / RADIUS_M * t_s
+    """Return correct data: a circle to the right at 4 m/s, and images over level ground.
+
+    The bank angle gives the centripetal acceleration; the height sways by 20 cm.
+    """
+    turn_rad_s = SPEED_M_S / RADIUS_M
+    angle = turn_rad_s * t_s
     position = np.array(
-        [RADIUS_M * math.sin(angle), RADIUS_M * (1.0 - math.cos(angle)), -HEIGHT_M - 0.01 * t_s]
+        [
+            RADIUS_M * math.sin(angle),
+            RADIUS_M * (1.0 - math.cos(angle)),
+            -HEIGHT_M - 0.2 * math.sin(t_s),
+        ]
     )
-    velocity = np.array([SPEED_M_S * math.cos(angle), SPEED_M_S * math.sin(angle), -0.01])
-    attitude = np.array([math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)])
+    velocity = np.array(
+        [SPEED_M_S * math.cos(angle), SPEED_M_S * math.sin(angle), -0.2 * math.cos(t_s)]
+    )
+    attitude, rates = banked(BANK_RAD, angle, turn_rad_s, t_s)
     rows = np.arange(1, 7, dtype=np.uint16)[:, None] * np.full((1, 8), 700, np.uint16)
     time_us = round(t_s * US_PER_S)
     frame = Frame(round(30 * t_s), time_us, rows + np.uint16(round(10 * t_s) % 500), LENS)
-    return Told(Kinematics(position, velocity, attitude), frame, time_us + 5000)
+    return Told(Kinematics(position, velocity, attitude, rates), frame, time_us + 5000)
+
+
+def banked(
+    roll: float, yaw: float, turn_rad_s: float, t_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return attitude and body rates of a level turn, with a sway of a milliradian."""
+    roll += 1e-3 * math.sin(3.0 * t_s)
+    rates = np.array([3e-3 * math.cos(3.0 * t_s), math.sin(roll), math.cos(roll)])
+    return quat_from_euler(roll, 0.0, yaw), rates * np.array([1.0, turn_rad_s, turn_rad_s])
 
 
 Lie = Callable[[Told, Told, float], Told]
@@ -121,6 +144,47 @@ def spoilt(name: str, index: int, value: float) -> Lie:
     return of_state(name, lambda now, then, s: one(now, index, value))
 
 
+def held(name: str, index: int) -> Lie:
+    return of_state(name, lambda now, then, s: one(now, index, then[index]))
+
+
+def shifted(name: str, index: int, by: Callable[[float], float]) -> Lie:
+    return of_state(name, lambda now, then, s: one(now, index, now[index] + by(s)))
+
+
+def creep(s: float) -> float:
+    return s
+
+
+TEN_TURNS = 20.0 * math.pi
+
+
+def turned(by: Callable[[float], tuple[float, float, float]]) -> Lie:
+    """An attitude that is turned by roll, pitch and yaw [rad]."""
+
+    def change(now: np.ndarray, then: np.ndarray, s: float) -> np.ndarray:
+        return quat_from_euler(*(np.array(quat_to_euler(now)) + by(s)))
+
+    return of_state("quaternion", change)
+
+
+def heading_held(now: Told, then: Told, s: float) -> Told:
+    """Roll and pitch that go on, with the heading of the onset."""
+    roll, pitch, _ = quat_to_euler(now.state.quaternion)
+    heading = quat_to_euler(then.state.quaternion).yaw
+    return now.moved(quaternion=quat_from_euler(roll, pitch, heading))
+
+
+def climbing(down_m_s: float) -> Lie:
+    """A climb in position and velocity."""
+
+    def told(now: Told, then: Told, s: float) -> Told:
+        down = np.array([0.0, 0.0, down_m_s])
+        return now.moved(position=now.state.position + s * down, velocity=now.state.velocity + down)
+
+    return told
+
+
 LIES: dict[str, tuple[Lie, str, float]] = {
     **{
         f"{name} {word} {index}": (spoilt(name, index, value), TELEMETRY_WRONG, 0.0)
@@ -128,9 +192,15 @@ LIES: dict[str, tuple[Lie, str, float]] = {
         for word, value in (("nan", math.nan), ("infinite", math.inf))
         for index in (0, 2)
     },
-    "position frozen": (of_state("position", as_then), TELEMETRY_FROZEN, 2.0),
-    "velocity frozen": (of_state("velocity", as_then), TELEMETRY_FROZEN, 2.0),
-    "attitude frozen": (of_state("quaternion", as_then), TELEMETRY_FROZEN, 2.0),
+    **{
+        f"only {name} frozen": (of_state(name, as_then), TELEMETRY_WRONG, 1.0)
+        for name in ("position", "velocity", "quaternion", "rates")
+    },
+    **{
+        f"only {name} {index} frozen": (held(name, index), TELEMETRY_WRONG, 1.0)
+        for name in ("position", "velocity", "rates")
+        for index in range(3)
+    },
     "all frozen": (lambda now, then, s: replace(now, state=then.state), TELEMETRY_FROZEN, 2.0),
     "position jumps": (of_state("position", lambda n, t, s: n + 20 * NORTH), TELEMETRY_WRONG, 0.0),
     "position far off": (
@@ -141,23 +211,39 @@ LIES: dict[str, tuple[Lie, str, float]] = {
     "position runs away": (
         of_state("position", lambda n, t, s: n + 6.0 * s * NORTH),
         TELEMETRY_WRONG,
-        8.0,
+        0.5,
     ),
-    "position mirrored": (of_state("position", lambda n, t, s: -n), TELEMETRY_WRONG, 8.0),
+    **{
+        f"position {index} creeps 1 m/s": (shifted("position", index, creep), TELEMETRY_WRONG, 4.6)
+        for index in range(3)
+    },
+    "position mirrored": (of_state("position", lambda n, t, s: -n), TELEMETRY_WRONG, 0.5),
+    "height 100 m up": (shifted("position", 2, lambda s: -100.0), TELEMETRY_WRONG, 0.0),
+    "height 100 m down": (shifted("position", 2, lambda s: 100.0), TELEMETRY_WRONG, 0.0),
+    "climb without vertical velocity": (
+        shifted("position", 2, lambda s: -3.0 * s),
+        TELEMETRY_WRONG,
+        0.5,
+    ),
+    "vertical velocity without climb": (
+        shifted("velocity", 2, lambda s: -3.0),
+        TELEMETRY_WRONG,
+        0.5,
+    ),
+    "upside down": (turned(lambda s: (math.pi, 0.0, 0.0)), TELEMETRY_WRONG, 0.0),
+    "ten turns a second": (shifted("rates", 2, lambda s: TEN_TURNS), TELEMETRY_WRONG, 0.0),
+    "body rate nan": (spoilt("rates", 0, math.nan), TELEMETRY_WRONG, 0.0),
     "position nearly frozen": (
         of_state("position", lambda n, t, s: t + 0.01 * (n - t)),
         TELEMETRY_WRONG,
-        15.0,
+        1.0,
     ),
     "velocity absurd": (of_state("velocity", lambda n, t, s: 10.0 * n), TELEMETRY_WRONG, 0.0),
-    "velocity mirrored": (of_state("velocity", lambda n, t, s: -n), TELEMETRY_WRONG, 8.0),
+    "velocity mirrored": (of_state("velocity", lambda n, t, s: -n), TELEMETRY_WRONG, 0.5),
     "attitude zero": (of_state("quaternion", lambda n, t, s: 0.0 * n), TELEMETRY_WRONG, 0.0),
     "attitude doubled": (of_state("quaternion", lambda n, t, s: 2.0 * n), TELEMETRY_WRONG, 0.0),
-    "too high": (
-        of_state("position", lambda n, t, s: n - np.array([0, 0, 3 * s])),
-        OUT_OF_BOUNDS,
-        6.0,
-    ),
+    "too high": (climbing(-3.0), OUT_OF_BOUNDS, 4.0),
+    "too low": (climbing(3.0), OUT_OF_BOUNDS, 5.0),
     "hold": (mode("hold"), TAKEN_OVER, 0.0),
     "return": (mode("return to launch"), TAKEN_OVER, 0.0),
     "land": (mode("land"), TAKEN_OVER, 0.0),
@@ -261,7 +347,7 @@ def test_a_lie_ends_the_flight_in_time(name: str, period_s: float) -> None:
 
 @pytest.mark.parametrize("period_s", PERIODS_S)
 def test_an_honest_flight_goes_on(period_s: float) -> None:
-    assert fly(honest, period_s, 300.0, LimitSettings()) == (None, 300.0)
+    assert fly(honest, period_s, 300.0, LimitSettings(flight_s=301.0)) == (None, 300.0)
 
 
 def test_noise_resets_and_a_camera_with_another_clock_are_believed() -> None:
@@ -269,16 +355,144 @@ def test_noise_resets_and_a_camera_with_another_clock_are_believed() -> None:
 
     def told(t_s: float) -> Told:
         now = honest(t_s)
-        reset = 3.0 * NORTH if t_s > 20.0 else 0.0
+        reset = 0.8 * NORTH if t_s > 20.0 else 0.0
         now = now.moved(
-            position=now.state.position + rng.normal(0, 0.3, 3) + reset,
-            velocity=now.state.velocity + rng.normal(0, 0.3, 3),
+            position=now.state.position + rng.normal(0, 0.1, 3) + reset,
+            velocity=now.state.velocity + rng.normal(0, 0.1, 3),
         )
         # Stamped by a clock that began a year ago, up to half a second late.
         stamp = now.frame.capture_time_us - 31_536_000 * US_PER_S
         return now.seen(capture_time_us=stamp - int(rng.integers(0, US_PER_S // 2)))
 
-    assert fly(told, 0.5, 300.0, LimitSettings())[0] is None
+    assert fly(told, 0.5, 300.0, LimitSettings(flight_s=301.0))[0] is None
+
+
+def contradiction(lie: Lie, period_s: float, seconds: float) -> tuple[str, float]:
+    """Return the detail of the ending by a lie from 4 s on, and its time [s]."""
+    then = honest(4.0)
+    told = lambda t_s: honest(t_s) if t_s < 4.0 else lie(honest(t_s), then, t_s - 4.0)  # noqa: E731
+    ending, at_s = fly(told, period_s, 4.0 + seconds, LimitSettings())
+    assert ending is not None
+    assert ending.reason == TELEMETRY_WRONG
+    return ending.detail, at_s - 4.0
+
+
+def bank(angle: float) -> Callable[[float], tuple[float, float, float]]:
+    return lambda s: (angle, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("lie", "detail", "within_s"),
+    [
+        (shifted("position", 2, lambda s: -100.0), "position and velocity have parted by 100", 0.1),
+        (shifted("position", 0, creep), "position and velocity have parted by 1.", 1.4),
+        (shifted("velocity", 2, lambda s: 1.0), "position and velocity have parted by 1.", 1.4),
+        (turned(lambda s: (0.0, 0.0, 1.5)), "heading and yaw rate have parted by 8", 0.1),
+        (turned(lambda s: (0.0, 0.0, 0.8 * s)), "heading and yaw rate have parted by 2", 0.7),
+        (shifted("rates", 2, lambda s: 0.8), "heading and yaw rate have parted by 2", 0.7),
+        (turned(bank(math.radians(50.0))), "velocity and tilt have parted by 1", 1.6),
+        (turned(bank(math.pi)), "the vehicle is upside down", 0.1),
+        (shifted("rates", 0, lambda s: -TEN_TURNS), "a body rate of 62.8 rad/s", 0.1),
+        (held("position", 2), "only the height has not changed for 1.", 1.2),
+        (held("rates", 1), "only the pitch rate has not changed for 1.", 1.2),
+        (heading_held, "only the heading has not changed for 1.", 1.2),
+    ],
+)
+def test_each_contradiction_is_named(lie: Lie, detail: str, within_s: float) -> None:
+    found, after_s = contradiction(lie, 0.1, 5.0)
+    assert found.startswith(detail)
+    assert after_s <= within_s
+
+
+def test_telemetry_without_body_rates_is_believed() -> None:
+    """Not every flight controller reports them: None, or NaN from the start."""
+    for rates in (None, np.full(3, math.nan)):
+        told = lambda t_s, rates=rates: replace(  # noqa: E731
+            honest(t_s), state=replace(honest(t_s).state, rates=rates)
+        )
+        assert fly(told, 0.5, 60.0, LimitSettings())[0] is None
+
+
+@pytest.mark.parametrize(("commands", "believed"), [("velocity", False), ("body_rates", True)])
+def test_only_velocity_commands_limit_the_speed(commands: CommandKind, believed: bool) -> None:
+    """Policies of body rates fly at 25 m/s; 3 x 5 + 10 m/s is the bound of the others."""
+    pilot = PilotSettings(altitude_m=HEIGHT_M, commands=commands)
+    limits = VehicleLimits(LimitSettings(radius_m=1000.0), GOAL, pilot)
+    state = replace(honest(1.0).state, velocity=np.array([25.5, 0.0, 0.0]))
+    ending = limits.broken(OURS, state, US_PER_S)
+    assert (ending is None) == believed
+
+
+# --- before the navigation
+
+
+def standing(t_s: float, down_m: float = 0.0, north_m: float = 0.0, yaw: float = 0.0) -> Kinematics:
+    """Return the state of a vehicle on the ground, with millimetres of noise."""
+    noise = 1e-3 * np.sin(np.arange(1.0, 4.0) * 37.0 * t_s)
+    attitude = quat_from_euler(0.0, 0.0, yaw + noise[0])
+    return Kinematics(np.array([north_m, 0.0, down_m]) + noise, noise, attitude, noise)
+
+
+def take_off(before: dict[str, float], after: dict[str, float]) -> Ending | None:
+    """Stand for a second, climb unwatched for ten seconds, and look once in the air."""
+    limits = Limits(LimitSettings(), GOAL, PILOT)
+    for k in range(10):
+        now_s = 0.1 * k
+        if (ending := limits.watch(standing(now_s, **before), round(now_s * US_PER_S))) is not None:
+            return ending
+    limits.begin(11 * US_PER_S)
+    return limits.broken(OURS, standing(11.0, **after), None, 11 * US_PER_S)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "detail"),
+    [
+        ({}, {"down_m": -HEIGHT_M}, None),
+        ({"north_m": 30.0}, {"down_m": -HEIGHT_M, "north_m": 30.4}, None),
+        (
+            {},
+            {"down_m": -HEIGHT_M, "north_m": 3.0},
+            "the take-off to 2.5 m moved the position by 3.0 m",
+        ),
+        ({}, {"down_m": -8.0}, "the take-off to 2.5 m changed the height by 8.0 m"),
+        (
+            {"down_m": 100.0},
+            {"down_m": 97.5},
+            "the take-off to 2.5 m ended at a height of -97.5 m",
+        ),
+        (
+            {},
+            {"down_m": -HEIGHT_M, "yaw": 1.0},
+            "the take-off to 2.5 m turned the nose by 57 deg",
+        ),
+    ],
+)
+def test_a_take_off_is_vertical(
+    before: dict[str, float], after: dict[str, float], detail: str | None
+) -> None:
+    ending = take_off(before, after)
+    assert (None if ending is None else ending.detail) == detail
+    assert ending is None or ending.reason == TELEMETRY_WRONG
+
+
+def test_a_jump_on_the_ground_is_found_before_the_take_off() -> None:
+    limits = Limits(LimitSettings(), GOAL, PILOT)
+    assert limits.watch(standing(0.0), 0) is None
+    ending = limits.watch(standing(0.1, north_m=10.0), US_PER_S // 10)
+    assert ending is not None
+    assert limits.ending is ending
+    assert ending.detail == "position and velocity have parted by 10.0 m"
+
+
+def test_every_flight_has_a_time_limit() -> None:
+    """By default 120 s, and ten times the time straight to the goal at the maximum speed."""
+    asked = with_time_limit(LimitSettings(), (30.0, 40.0), PilotSettings(max_speed_m_s=5.0))
+    assert asked.flight_s == 220.0
+    assert with_time_limit(LimitSettings(), GOAL, PILOT, 3610.0).flight_s == 3610.0
+    assert with_time_limit(LimitSettings(flight_s=9.0), GOAL, PILOT, 3610.0).flight_s == 9.0
+    ending, at_s = fly(honest, 0.5, 200.0, LimitSettings())
+    assert ending == Ending(OUT_OF_TIME, "170 s; at most 170 s")
+    assert at_s == 170.0
 
 
 def test_a_mode_that_is_reported_late_is_waited_for() -> None:
