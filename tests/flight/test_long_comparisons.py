@@ -62,12 +62,14 @@ def test_false_alarms_are_counted_and_flights_go_on(
     made_up = iter(("success", "collision", "aborted"))
     broken = str(Ending(OUT_OF_BOUNDS, "far"))
 
-    flown = honest_flights.honest("no-obstacles", "no-obstacles", 1, behaviour_today())
+    setups = honest_flights.SETUPS
+    flown = honest_flights.honest(setups[0], 1, behaviour_today())
     assert (flown.outcome, flown.alarm) == ("success", "")
     assert flown.decisions > 5
 
-    def another(arena: str, policy: str, seed: int, behaviour: str) -> honest_flights.Honest:
-        return replace(flown, arena=arena, seed=seed, outcome=next(made_up), alarm=broken)
+    def another(setup: honest_flights.Setup, seed: int, behaviour: str) -> honest_flights.Honest:
+        changes = {**setup._asdict(), "seed": seed, "outcome": next(made_up), "alarm": broken}
+        return replace(flown, **changes)
 
     lines = flown_lines.FlownLines(tmp_path / "flights.csv", honest_flights.COLUMNS)
     lines.add(honest_flights.row_of(flown))
@@ -77,7 +79,7 @@ def test_false_alarms_are_counted_and_flights_go_on(
     table = read_json(tmp_path / "table.json", 1, "table")
     *_, last = table["rows"]
     assert last[:2] == ["all", "4"]
-    assert last[6] == "2", "one after a collision is none"
+    assert last[3] == "2", "one after a collision is none"
     other = replace(flown, seed=9, behaviour="f" * 16)
     flown_lines.FlownLines(tmp_path / "flights.csv", honest_flights.COLUMNS).add(
         honest_flights.row_of(other)
