@@ -20,7 +20,13 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import MeasuredResult, read_card
 from airl_mav.policy.card_writing import write_card
-from published import tables_hardware_gap, tables_levels, tables_policies, tables_response
+from published import (
+    tables_hardware_gap,
+    tables_levels,
+    tables_lies,
+    tables_policies,
+    tables_response,
+)
 from published.blocks import Block, block_of
 from published.declared import read_declared
 from published.record import ROOT, FlownRun, Record
@@ -37,7 +43,7 @@ PROVENANCE = "provenance"
 
 POLICIES = ROOT / "profiles" / "policies"
 
-TABLES = (tables_hardware_gap, tables_levels, tables_policies, tables_response)
+TABLES = (tables_hardware_gap, tables_levels, tables_lies, tables_policies, tables_response)
 """Modules whose import declares their blocks."""
 
 
