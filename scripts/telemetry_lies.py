@@ -596,11 +596,11 @@ AGREED = "all values agree, as in GPS drift"
 DELAYED = "a delay below 1 s is load, and MAVSDK's position has no time stamp"
 TURNED = "too slow or too fast for two checks a second"
 TILTED = "a tilt that wind would explain"
-SILENT = "the decision timeout is 2 s"
+SILENT = "telemetry and decisions may pause for 2 s"
+POSSIBLE = "a possible image"
 
 UNDETECTABLE: Mapping[str, str] = {
     "north position creeps 0.2 m/s": SLOW,
-    "depth creeps 0.2 m/s": SLOW,
     "position and velocity drift north 1 m/s together": AGREED,
     "position and velocity drift down 0.5 m/s together": AGREED,
     "position and velocity replayed": AGREED,
@@ -614,10 +614,10 @@ UNDETECTABLE: Mapping[str, str] = {
     "heading creeps 5 deg/s": TURNED,
     "heading ten turns/s": TURNED,
     "frame sequence frozen": SILENT,
-    "frames lost": SILENT,
-    "frames late 3 s": SILENT,
     "all telemetry ever later": DELAYED,
     "pitch jumps 30 deg": TILTED,
+    "all telemetry frozen": SILENT,
+    "image scaled 2": POSSIBLE,
 }
 """Reason for each lie that moves the vehicle and is not found in time."""
 
