@@ -49,10 +49,13 @@ REASONS = (
 MODE_KNOWN_S = 3.0
 """Maximum latency of the report of a mode change [s]: three heartbeats of 1 Hz."""
 
-DRIFT_M, SPAN_M = 1.0, 2.0
-"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m]. It grows with
-the time between two checks, up to `SPAN_M`. A velocity that changes by 1 g and back leaves
-g dt^2 / 4. Honest flights: 0.4 m at 2 Hz, 2.8 m at 1 Hz."""
+DRIFT_M, SELDOM_M = 1.0, 6.0
+"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m], with frequent
+and with seldom checks. A velocity that changes by 1 g and back adds g dt^2 / 4. Honest flights:
+0.4 m at 2 Hz, 4.7 m at 1 Hz."""
+
+SELDOM_S = 0.7
+"""Time between two checks that are seldom [s]: the tilt has changed unseen."""
 
 DRIFT_S = 5.0
 
@@ -68,6 +71,9 @@ SWAY_S = 2.0
 
 STEEP = 0.25
 """Minimum cosine of the tilt for tan(tilt)."""
+
+FLIP_S = 0.5
+"""Maximum time upside down [s]. Policies of body rates brake so for 0.2 s."""
 
 UNWATCHED_S = 2.0
 """Time between two checks after which the sums begin again [s]. Lockstep skips the take-off."""
@@ -388,6 +394,7 @@ class MotionMonitor:
         self._numbers: tuple[Any, ...] = ()
         self._changed_us: list[int] = []
         self._forget()
+        self._upright_us = 0
         self._rates = False
         """True once body rates were reported."""
 
@@ -428,7 +435,9 @@ class MotionMonitor:
         # Third column of the rotation: the body's down axis in NED.
         north, east = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
         down = 1.0 - 2.0 * (x * x + y * y)
-        if down < 0.0:
+        if down > 0.0:
+            self._upright_us = now_us
+        elif now_us - self._upright_us > FLIP_S * US_PER_S:
             return "the vehicle is upside down"
         yaw, yaw_rate = quat_yaw(state.quaternion), math.nan
         if rates:
@@ -470,7 +479,8 @@ class MotionMonitor:
             rest_m = b[k] - a[k] - mean_s * (a[3 + k] + b[3 + k])
             drift_m[k] = leak * drift_m[k] + rest_m
         parted_m = math.hypot(*drift_m)
-        bound_m = DRIFT_M + min(SPAN_M, 0.25 * GRAVITY_M_S2 * dt_s**2)
+        seldom = dt_s > SELDOM_S
+        bound_m = SELDOM_M if seldom else DRIFT_M + 0.25 * GRAVITY_M_S2 * dt_s**2
         behind, self._behind = self._behind, parted_m > bound_m
         # After a pause of the link the position is old. The next one decides.
         if parted_m > bound_m and (behind or _beside_m(drift_m, b[3:6], dt_s) > bound_m):
@@ -478,12 +488,15 @@ class MotionMonitor:
         if math.isfinite(last.yaw_rate_rad_s + now.yaw_rate_rad_s):
             turned = mean_s * (last.yaw_rate_rad_s + now.yaw_rate_rad_s)
             # A steep vehicle has no heading.
-            weight = min(last.upright, now.upright) ** 2
+            weight = max(0.0, min(last.upright, now.upright)) ** 2
             self._turn_rad *= sway_leak
             self._turn_rad += weight * wrap_pi(now.yaw_rad - last.yaw_rad - turned)
             if abs(self._turn_rad) > HEADING_RAD + HEADING_RAD_S * dt_s:
                 parted_deg = math.degrees(abs(self._turn_rad))
                 return f"heading and yaw rate have parted by {parted_deg:.0f} deg"
+        if seldom or min(last.upright, now.upright) < STEEP:
+            self._push_m_s = [0.0, 0.0]
+            return None
         # The thrust along the body's up axis carries the weight and the vertical acceleration.
         up_m_s = 0.5 * (GRAVITY_M_S2 * dt_s - (b[5] - a[5]))
         for k in range(2):
