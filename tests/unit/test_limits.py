@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S, CommandKind
 from airl_mav.core.frames import quat_from_euler, quat_to_euler
-from airl_mav.policy.actions import CommandKind
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.scenario.model import LimitSettings, PilotSettings
