@@ -32,6 +32,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import wilson
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.profiles.vehicle import WindSettings
+from airl_mav.rehearsal.observer import Observer
 from airl_mav.report.document import Column, TableView, print_table, write_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -126,6 +127,18 @@ def row_of(flight: Honest) -> dict[str, object]:
     return asdict(flight)
 
 
+class Phases(Observer):
+    """Start of the landing."""
+
+    landing_us: float = math.inf
+    """Simulated time [µs]; inf = none."""
+
+    def phase(self, name: str, time_us: int) -> None:
+        """Store the first landing."""
+        if name == "landing":
+            self.landing_us = min(self.landing_us, time_us)
+
+
 def conditions_of(setup: Setup, seed: int) -> tuple[float, str]:
     """Return wind [m/s] and latency of a seed: every pair once in 16 seeds.
 
@@ -156,12 +169,15 @@ def alarm_of(record: EpisodeRecord) -> str:
 def honest(setup: Setup, seed: int, behaviour: str) -> Honest:
     """Fly one seed."""
     resolved = resolve(scenario_of(setup, seed))
-    flown = fly(resolved, resolved.fresh_policy(seed), 0, seed)
+    phases = Phases()
+    flown = fly(resolved, resolved.fresh_policy(seed), 0, seed, observer=phases)
     record = flown.record
     begun_us = record.ended_us if record.navigation_us is None else record.navigation_us
     navigated_s = (record.ended_us - begun_us) / 1e6
     decisions = len(flown.latency["capture_us"])
-    alarm, (wind_m_s, latency) = alarm_of(record), conditions_of(setup, seed)
+    # After the verdict, a vehicle may hit something behind the goal.
+    alarm = alarm_of(record) if phases.landing_us < record.ended_us else ""
+    wind_m_s, latency = conditions_of(setup, seed)
     outcome = record.outcome.value
     return Honest(
         seed, *setup, wind_m_s, latency, outcome, navigated_s, decisions, alarm, behaviour
