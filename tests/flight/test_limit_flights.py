@@ -86,7 +86,7 @@ def test_who_takes_over_has_the_vehicle(mode: Mode, breaks: bool) -> None:
         accepted_us = simulation.recorder.setpoints.arrays()["accepted_us"]
         assert simulation.autopilot.flight.phase is FlightPhase.AIR
     (result,) = results
-    assert result.reason == ("policy failed: ZeroDivisionError: " if breaks else "taken over")
+    assert result.reason == ("policy failed: ZeroDivisionError:" if breaks else "taken over")
     assert result.notes[-1].startswith("taken over: the mode is ")
     assert [each for each, _ in modes[-2:]] == [Mode.OFFBOARD, mode]
     assert accepted_us.max() <= modes[-1][1] + US_PER_S + US_PER_S // 2
