@@ -54,7 +54,8 @@ class Companions:
             self._memory = DecisionMemory(n)
         self._earlier = np.zeros((earlier, n, *image.shape), image.dtype)
         """Images of previous decisions, newest first; 0 = no return, black, or missing."""
-        self._states = Kinematics(*(np.zeros((earlier, n, size)) for size in (3, 3, 4)))
+        position, velocity, quaternion = (np.zeros((earlier, n, size)) for size in (3, 3, 4))
+        self._states = Kinematics(position, velocity, quaternion)
         """States of previous decisions."""
         self._further = {
             name: np.zeros((count, n, *lens.shape), lens.dtype)

@@ -362,8 +362,10 @@ class Navigation(Stateful):
     def truth(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return a copy of the true states."""
         fleet = self.fleet
-        state = (fleet.position, fleet.velocity, fleet.quaternion, fleet.omega)
-        return Kinematics(*(np.array(each[rows]) for each in state))
+        position, velocity = fleet.position[rows].copy(), fleet.velocity[rows].copy()
+        return Kinematics(
+            position, velocity, fleet.quaternion[rows].copy(), fleet.omega[rows].copy()
+        )
 
     def whole_truth(self) -> WholeTruth:
         """Return the simulator's complete state: live arrays, read-only by convention."""
