@@ -485,6 +485,10 @@ class MotionMonitor:
         # After a pause of the link the position is old. The next one decides.
         if parted_m > bound_m and (behind or _beside_m(drift_m, b[3:6], dt_s) > bound_m):
             return f"position and velocity have parted by {parted_m:.1f} m"
+        if seldom:
+            # Two samples say little about turns and thrust in between.
+            self._turn_rad, self._push_m_s = 0.0, [0.0, 0.0]
+            return None
         if math.isfinite(last.yaw_rate_rad_s + now.yaw_rate_rad_s):
             turned = mean_s * (last.yaw_rate_rad_s + now.yaw_rate_rad_s)
             # A steep vehicle has no heading.
@@ -494,7 +498,7 @@ class MotionMonitor:
             if abs(self._turn_rad) > HEADING_RAD + HEADING_RAD_S * dt_s:
                 parted_deg = math.degrees(abs(self._turn_rad))
                 return f"heading and yaw rate have parted by {parted_deg:.0f} deg"
-        if seldom or min(last.upright, now.upright) < STEEP:
+        if min(last.upright, now.upright) < STEEP:
             self._push_m_s = [0.0, 0.0]
             return None
         # The thrust along the body's up axis carries the weight and the vertical acceleration.
