@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
+import zstandard
 from mcap import records as mcap_records
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import DataEnd, Metadata
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 from pydantic import TypeAdapter, ValidationError
 
@@ -98,7 +99,7 @@ class BlackBoxFile(McapFile):
 _RECORD_BYTES = 64 * 2**20
 """Maximum record length; keeps a damaged length field from allocating gigabytes."""
 
-_TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError)
+_TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError, zstandard.ZstdError)
 """Exceptions raised for a truncated or damaged record."""
 
 M = TypeVar("M", bound=Message)
@@ -148,6 +149,22 @@ def read_black_box(path: Path) -> BlackBox:
     return box
 
 
+def _records(reader: StreamReader) -> Iterator[Any]:
+    """Yield all records. Raises ValueError for a chunk of another program, or too large."""
+    for record in reader.records:
+        if not isinstance(record, mcap_records.Chunk):
+            yield record
+            continue
+        if record.compression not in ("", "zstd"):
+            raise ValueError(f"compression {record.compression}: must be zstd")
+        size = record.uncompressed_size
+        if record.compression:  # A size within the data has precedence over the chunk's.
+            size = max(size, zstandard.frame_content_size(record.data))
+        if size > _RECORD_BYTES:
+            raise ValueError(f"a chunk of {size:,} bytes: at most {_RECORD_BYTES:,}")
+        yield from breakup_chunk(record, validate_crc=True)
+
+
 def _whole_records(reader: StreamReader) -> Iterator[Any]:
     """Yield metadata, the end record, and messages with their kinds, up to the first damaged one.
 
@@ -155,7 +172,7 @@ def _whole_records(reader: StreamReader) -> Iterator[Any]:
     """
     kinds = {topic: kind for kind, topic in TOPICS.items()}
     adapters: dict[int, tuple[type[Message], TypeAdapter[Any]]] = {}
-    records = reader.records
+    records = _records(reader)
     while True:
         try:
             record = next(records)

@@ -194,7 +194,7 @@ def load_learned(
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     blank = {k: np.zeros((1, *box.shape), box.dtype) for k, box in boxes(card.observation).items()}
     try:
-        policy.with_generator(np.random.default_rng()).outputs(blank)
+        policy.with_generator(np.random.default_rng(0)).outputs(blank)
     except Exception as error:  # Of any type, also from a torch program.
         raise errors.UsageError(f"policy {card.name}: {' '.join(str(error).split())}") from None
     return policy

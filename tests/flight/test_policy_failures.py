@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 pytest.importorskip("onnx", reason="needs the [train] extra")
@@ -25,6 +26,7 @@ from airl_mav.policy import registry
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from tests.support import hostile_policies
+from tests.support.processes import wait_until
 
 LEVELS = ["gym", "lockstep", pytest.param("sitl", marks=pytest.mark.nightly)]
 GIB = 1 << 30
@@ -84,9 +86,11 @@ def test_ctrl_c_ends_a_trial(tmp_path: Path) -> None:
     folder = hostile_policies.write(tmp_path, "endless")
     words = [sys.executable, "-m", "airl_mav.cli.main", "evaluate", str(folder), "--level", "gym"]
     with subprocess.Popen([*words, "--out", str(tmp_path / "run")], stderr=subprocess.PIPE) as airl:
-        time.sleep(4.0)
+        process = psutil.Process(airl.pid)
+        wait_until(lambda: bool(process.children()), "the trial", 60.0)
+        time.sleep(1.0)
         airl.send_signal(signal.SIGINT)
-        assert airl.communicate(timeout=5.0)[1] == b""
+        assert airl.communicate(timeout=10.0)[1] == b""
         assert airl.returncode == 130
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 from matplotlib import get_cachedir
 
 LIMIT_S = 60.0
@@ -22,7 +23,7 @@ LIMIT_S = 60.0
 PATIENCE_S = 240.0
 """Timeout of a command that waits [wall s]."""
 
-LIMIT_BYTES = 1 << 30
+LIMIT_BYTES, PROGRAM_BYTES = 1 << 30, 350 << 20
 """Maximum resident memory of a command."""
 
 ADDRESSES = 6 << 30
@@ -102,7 +103,7 @@ def read(entry: Entry, root: Path) -> Result:
     before = fingerprint(outside)
     kept = {path.name for path in root.iterdir()} | {"output"}
     words = [word.replace("{d}", str(folder)) for word in entry.words]
-    began = time.monotonic()
+    began, inherited = time.monotonic(), psutil.Process().memory_info().rss
     child = os.fork()
     if child == 0:
         _child(words, folder, outside, root / "output", alone=entry.alone)
@@ -120,7 +121,9 @@ def read(entry: Entry, root: Path) -> Result:
         problems.append(f"ended by {code}")
     if seconds > LIMIT_S:
         problems.append("too slow")
-    if (peak := used.ru_maxrss * 1024) > LIMIT_BYTES:
+    # The child inherits the memory of this process, instead of that of a fresh program.
+    peak = max(0, used.ru_maxrss * 1024 - inherited) + PROGRAM_BYTES
+    if peak > LIMIT_BYTES:
         problems.append("too much memory")
     if CONTROL.search(output):
         problems.append("control sequence on the terminal")

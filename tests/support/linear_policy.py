@@ -41,11 +41,10 @@ def weights() -> tuple[np.ndarray, np.ndarray]:
     return matrix.astype(np.float32), bias.astype(np.float32)
 
 
-def model(broken: bool = False) -> bytes:
-    """Return the policy as ONNX; a broken one gives no numbers."""
+def model(offset: float = 0.0) -> bytes:
+    """Return the policy as ONNX, with an offset of all outputs; NaN gives no numbers."""
     matrix, bias = weights()
-    if broken:
-        bias = bias + np.float32(np.nan)
+    bias = bias + np.float32(offset)
     nodes = [
         helper.make_node("Cast", ["depth"], ["bytes"], to=TensorProto.FLOAT),
         helper.make_node("Mul", ["bytes", "scale"], ["grey"]),
@@ -73,10 +72,10 @@ def model(broken: bool = False) -> bytes:
     return data
 
 
-def write_linear(folder: Path, *, broken: bool = False, **changes: Any) -> Path:
+def write_linear(folder: Path, *, offset: float = 0.0, **changes: Any) -> Path:
     """Write the policy with its card; changes go to the card's facts."""
     folder.mkdir(parents=True, exist_ok=True)
-    data = model(broken)
+    data = model(offset)
     (folder / ONNX_FILE).write_bytes(data)
     known: dict[str, Any] = {
         "name": "linear",

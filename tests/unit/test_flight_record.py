@@ -30,7 +30,7 @@ def test_lines_read_back_as_they_were(record: EpisodeRecord, tmp_path: Path) -> 
     ]
     path = tmp_path / "episodes.jsonl"
     append_lines(path, (version.as_data() for version in versions))
-    lines = read_lines(path, SCHEMA)
+    lines = list(read_lines(path, SCHEMA))
     assert [EpisodeRecord.from_data(data, place) for place, data in lines] == versions
     assert [place for place, _ in lines] == [f"{path}:{number}" for number in (1, 2, 3)]
 

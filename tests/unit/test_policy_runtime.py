@@ -25,6 +25,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy import card as cards
+from airl_mav.policy import registry
 from airl_mav.policy.actions import Action, ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, PolicyCard, Runtime, TorchRuntime, read_card
 from airl_mav.policy.card_writing import write_card
@@ -327,7 +328,8 @@ def test_policies_are_found_by_name_and_by_path(
     assert find_policy("./continuous").name == "continuous"
 
     # As shipped: profiles/policies/<name>/
-    monkeypatch.setattr(cards, "profiles_dir", lambda: exported.parent / "shipped")
+    for module in (cards, registry):
+        monkeypatch.setattr(module, "profiles_dir", lambda: exported.parent / "shipped")
     shutil.copytree(exported, exported.parent / "shipped" / "policies")
     monkeypatch.chdir("/")
     assert policy_names() == ["greedy", "continuous", "discrete"]
