@@ -400,6 +400,7 @@ class MotionMonitor:
 
     def _forget(self) -> None:
         self._drift_m = [0.0, 0.0, 0.0]
+        self._pause_m = 0.0
         self._turn_rad = 0.0
         self._push_m_s = [0.0, 0.0]
         self._behind = False
@@ -480,7 +481,11 @@ class MotionMonitor:
             drift_m[k] = leak * drift_m[k] + rest_m
         parted_m = math.hypot(*drift_m)
         seldom = dt_s > SELDOM_S
-        bound_m = SELDOM_M if seldom else DRIFT_M + 0.25 * GRAVITY_M_S2 * dt_s**2
+        # A pause leaves a drift; its allowance fades with it.
+        self._pause_m = SELDOM_M if seldom else leak * self._pause_m
+        bound_m = self._pause_m
+        if not seldom:
+            bound_m += DRIFT_M + 0.25 * GRAVITY_M_S2 * dt_s**2
         behind, self._behind = self._behind, parted_m > bound_m
         # After a pause of the link the position is old. The next one decides.
         if parted_m > bound_m and (behind or _beside_m(drift_m, b[3:6], dt_s) > bound_m):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,10 @@ def test_a_crash_of_a_trial_is_one_line(function: str, ending: str) -> None:
 def test_ctrl_c_ends_a_trial(tmp_path: Path) -> None:
     folder = hostile_policies.write(tmp_path, "endless")
     words = [sys.executable, "-m", "airl_mav.cli.main", "evaluate", str(folder), "--level", "gym"]
-    with subprocess.Popen([*words, "--out", str(tmp_path / "run")], stderr=subprocess.PIPE) as airl:
+    words += ["--out", str(tmp_path / "run")]
+    # A job in the background of a script ignores SIGINT.
+    restored = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(words, stderr=subprocess.PIPE, preexec_fn=restored) as airl:
         process = psutil.Process(airl.pid)
         wait_until(lambda: bool(process.children()), "the trial", 60.0)
         time.sleep(1.0)

@@ -205,12 +205,23 @@ def test_the_time_of_a_flight_counts_from_its_start() -> None:
     reasons = []
     for t_s in np.arange(3.0, 13.9, 0.4):
         # As from an estimator: no value stays the same.
-        still, noise = state(), 1e-6 * math.sin(t_s)
+        still, noise = state(), 1e-4 * math.sin(t_s)
         now = Kinematics(still.position + noise, still.velocity + noise, still.quaternion + noise)
         found = limits.broken(status, now, round(t_s * US_PER_S))
         reasons.append(found.reason if found else None)
     assert reasons[:-2] == [None] * (len(reasons) - 2)
     assert reasons[-2:] == [OUT_OF_TIME] * 2
+
+
+@pytest.mark.parametrize("check_s", [0.1, 1.3])
+def test_a_vehicle_that_looks_left_and_right_is_believed(check_s: float) -> None:
+    limits, status = vehicle(silence_s=3.0), VehicleStatus(True, True, "offboard")
+    for t_s in np.arange(0.0, 20.0, check_s):
+        still, noise = state(), 1e-4 * math.sin(7.0 * t_s)
+        attitude = np.array(turned(2, 1.5 * math.sin(3.0 * t_s)))
+        rates = np.array([noise, -noise, 4.5 * math.cos(3.0 * t_s)])
+        now = Kinematics(still.position + noise, still.velocity + noise, attitude, rates)
+        assert limits.broken(status, now, round(t_s * US_PER_S)) is None
 
 
 def test_a_low_flight_has_a_low_ceiling() -> None:
