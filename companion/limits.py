@@ -181,11 +181,15 @@ class Limits:
         goal: Goal,
         pilot: PilotSettings,
         mount_rad: tuple[float, float] = (0.0, 0.0),
+        speed: float = 1.0,
     ) -> None:
-        """Prepare a flight to a goal; `mount_rad` are the camera's angles up and right [rad]."""
+        """Prepare a flight to a goal; `mount_rad` are the camera's angles up and right [rad].
+
+        `speed` is the simulated time per wall time: a late host counts that often.
+        """
         self.ending: Ending | None = None
         """Broken rule that has ended the flight; None = no rule broken."""
-        self._vehicle = VehicleLimits(settings, goal, pilot)
+        self._vehicle = VehicleLimits(settings, goal, pilot, speed)
         self._camera = CameraLimits(settings, mount_rad)
 
     def watch(self, state: Kinematics, now_us: int) -> Ending | None:
@@ -223,10 +227,13 @@ class Limits:
 class VehicleLimits:
     """Rules for reports of the flight controller."""
 
-    def __init__(self, settings: LimitSettings, goal: Goal, pilot: PilotSettings) -> None:
+    def __init__(
+        self, settings: LimitSettings, goal: Goal, pilot: PilotSettings, speed: float = 1.0
+    ) -> None:
         self.begun_us = 0
         """Start of navigation [µs]."""
         self._silence_us = round(settings.silence_s * US_PER_S)
+        self._late_us = round(0.5 * max(1.0, speed) * self._silence_us)
         radius_m, height_m = settings.radius_m, settings.height_m
         # The default radius leaves room for detours around obstacles.
         self.radius_m = 2.0 * math.hypot(*goal[:2]) + CLEARANCE_M if radius_m is None else radius_m
@@ -309,7 +316,7 @@ class VehicleLimits:
         if last_us is None:
             self._usual_us = behind_us
         changed_us = behind_us - self._usual_us
-        if abs(changed_us) > self._silence_us // 2:
+        if abs(changed_us) > self._late_us:
             return f"its time stamps have moved by {-changed_us / US_PER_S:+.1f} s"
         # The two clocks may drift, and a simulated one may be slow.
         share = 1.0 if last_us is None else (stamp_us - last_us) / (CLOCK_S * US_PER_S)

@@ -367,7 +367,8 @@ def fly_mission(
     settings, start = mission.pilot, mission.start
     watchdog = Watchdog(link, clock, mission.watchdog)
     navigating = False
-    limits = Limits(mission.limits, mission.goal, settings, mission.mount_rad)
+    speed = getattr(clock, "speed", 1.0)  # Simulated clocks do not depend on the host.
+    limits = Limits(mission.limits, mission.goal, settings, mission.mount_rad, speed)
     pilot = Pilot(
         link,
         frames,

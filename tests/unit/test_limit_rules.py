@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -222,6 +223,21 @@ def test_a_vehicle_that_looks_left_and_right_is_believed(check_s: float) -> None
         rates = np.array([noise, -noise, 4.5 * math.cos(3.0 * t_s)])
         now = Kinematics(still.position + noise, still.velocity + noise, attitude, rates)
         assert limits.broken(status, now, round(t_s * US_PER_S)) is None
+
+
+@pytest.mark.parametrize(("speed", "late_s", "ends"), [(1.0, 0.9, 0), (1.0, 1.1, 1), (8.0, 1.9, 0)])
+def test_stamps_may_be_late_by_a_second_of_the_host(speed: float, late_s: float, ends: int) -> None:
+    status = VehicleStatus(True, True, "offboard")
+    limits = VehicleLimits(LimitSettings(), (25.0, 0.0), PilotSettings(altitude_m=2.5), speed)
+    found = None
+    for k in range(10):
+        now_s = 0.1 * k + (late_s if k == 9 else 0.0)
+        still = state()
+        noise = 1e-4 * k
+        now = Kinematics(still.position + noise, still.velocity + noise, still.quaternion + noise)
+        stamped = replace(now, time_us=round(0.1 * k * US_PER_S) + 1)
+        found = limits.broken(status, stamped, round(now_s * US_PER_S))
+    assert (found is not None) == ends
 
 
 def test_a_low_flight_has_a_low_ceiling() -> None:
