@@ -8,6 +8,7 @@ unpickled.
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import random
@@ -249,8 +250,10 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
 def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None:
     """Write the files of a checkpoint and sync them to disk. Raises OSError."""
     weights, arrays, state = collect(model)
-    with files.replacing(partial / WEIGHTS) as path, path.open("wb") as file:
-        torch.save(weights, file)
+    # In memory first: torch reports a full disk as another error.
+    buffer = io.BytesIO()
+    torch.save(weights, buffer)
+    files.replace_file(partial / WEIGHTS, buffer.getvalue())
     files.save_arrays(partial / ARRAYS, arrays)
     text = json.dumps({"learner": state, "meta": meta}, default=_plain)
     files.replace_file(partial / STATE, text.encode())
