@@ -344,7 +344,8 @@ def check_whole_files(out: Path) -> None:
             # The archives of a run get their directory at the end of a command.
             held = files._archive(path.read_bytes()) if path.suffix == ".npz" else None
             with held or zipfile.ZipFile(path) as archive:
-                assert archive.testzip() is None
+                for member in archive.infolist():
+                    archive.read(member)  # Checks the CRC.
 
 
 @pytest.fixture(scope="module")
