@@ -16,7 +16,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError, machine_failure
 from airl_mav.core.fields import field_error
 from airl_mav.core.frames import Goal
 from airl_mav.core.resource_use import ProcessUse
@@ -202,6 +202,8 @@ class Failed(_Line):
     message: str
     usage: bool = False
     """True for invalid input: a restart would not help."""
+    errno: int | None = None
+    """System error of the machine, such as a full disk; `message` is its file."""
 
 
 Request = Annotated[
@@ -300,4 +302,9 @@ def serve(work: Callable[[Begin, ChildChannel], None], lost: type[Exception]) ->
         usage = isinstance(error, UsageError)
         channel.send(Failed(message=str(error), usage=usage))
         return EXIT_USAGE if usage else EXIT_BROKEN
+    except OSError as error:
+        if machine_failure(error) is None:
+            raise
+        channel.send(Failed(message=str(error.filename or ""), errno=error.errno))
+        return EXIT_BROKEN
     return 0

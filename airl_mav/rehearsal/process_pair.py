@@ -260,6 +260,8 @@ class ProcessPair:
         self._children[name].ending = True
         if event.usage:
             raise errors.UsageError(event.message)
+        if event.errno is not None:
+            raise OSError(event.errno, os.strerror(event.errno), event.message or None)
         raise LostError(f"the {name} gave up: {event.message}")
 
     def _died(self, name: str, exited: child_process.Exited) -> None:

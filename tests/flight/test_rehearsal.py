@@ -6,6 +6,7 @@ Both processes have stand-ins, so that events arrive in a test's exact order. `t
 
 from __future__ import annotations
 
+import errno
 import json
 import queue
 import re
@@ -808,6 +809,16 @@ def test_refusal_in_flight_is_a_usage_error_too(play: Callable[..., Run]) -> Non
     with pytest.raises(UsageError, match="cannot use this camera"):
         run.fly()
     assert [record.index for record in run.observer.records] == [0]
+    assert len(run.stage.all) == 2
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_a_full_disk_of_a_process_ends_the_run(play: Callable[..., Run]) -> None:
+    """No second attempt: the disk stays full."""
+    failed = Failed(message="run/episode.npz", errno=errno.ENOSPC)
+    run = play(FLOWN, [(FIRMWARE, failed)])
+    with pytest.raises(OSError, match=r"No space left on device: 'run/episode.npz'"):
+        run.fly()
     assert len(run.stage.all) == 2
     assert all(child.stopped for child in run.stage.all)
 
