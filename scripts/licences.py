@@ -19,21 +19,21 @@ ACCEPTED = re.compile(
     r"|mozilla public license|mpl|the unlicense|cc0|0bsd|hpnd|historical permission|public domain"
     r"|dfsg|\(?mit)"
 )
-"""Start of permissive licences, and of MPL 2.0, whose files stay under it."""
+"""Start of permissive licences, and of MPL 2.0: its files keep their licence."""
 
 REVIEWED = {
     "apsw": "any licence of the Open Source Initiative, for example MIT",
     "cyclonedds": "EPL-2.0 or BSD-3-Clause, at the user's choice",
     "pymavlink": "LGPLv3: imported, not changed; named in NOTICE",
 }
-"""Packages with another licence, or none in their metadata, and why they are accepted."""
+"""Packages with another or a missing licence, and the reason to accept them."""
 
 GPL_LIBRARIES = ("x264", "x265", "postproc", "rubberband", "vidstab", "xvid")
 """GPL parts of FFmpeg builds, by their names in files of wheels."""
 
 
 def licence_of(package: Distribution) -> str:
-    """Return the licence in a package's metadata; empty if there is none."""
+    """Return the licence in a package's metadata; empty if missing."""
     data = package.metadata.json
     if expression := data.get("license_expression"):
         return str(expression)

@@ -57,7 +57,7 @@ class Pictures:
     """Pictures of an environment's episodes, according to its `render_mode`."""
 
     def __init__(self, spec: EnvironmentSpec, kind: CameraKind, mode: str | None) -> None:
-        """Prepare pictures; nothing is drawn before it is asked for.
+        """Prepare pictures; `render` draws them.
 
         Args:
             spec: The environment.

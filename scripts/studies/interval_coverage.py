@@ -5,7 +5,7 @@
 `coverage`: share of samples whose 95 % interval contains the true value, for flight times of
 several distributions, flown flight times drawn again with replacement, and success rates.
 `comparison`: pairs until `airl verdict --against` decides, and its decisions, beside tests of a
-fixed number of pairs. The functions are those of the product. Writes table.json, which results.py
+fixed number of pairs. It calls the product's functions. Writes table.json, which results.py
 publishes.
 """
 

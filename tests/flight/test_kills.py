@@ -1,7 +1,7 @@
 """Commands killed at random moments (kill -9), on full disks and in read-only folders.
 
-Each command is killed again and again and resumed by the same words. Files are whole after each
-kill, no process stays, and the final results are those of an undisturbed run. Add more kills:
+Each command is killed repeatedly and resumed with the same arguments. Files are whole after each
+kill, no process stays, and the final results equal an undisturbed run. Add more kills:
 `AIRL_KILLS=50 pytest tests/flight/test_kills.py`.
 """
 
@@ -417,7 +417,7 @@ class Disk:
 
 
 def has_namespaces() -> bool:
-    """Return True if this machine lets users mount a disk of their own."""
+    """Return True if users can mount a disk on this machine."""
     told = subprocess.run(
         ["unshare", "-rm", "mount", "-t", "tmpfs", "tmpfs", "/mnt"],
         capture_output=True,

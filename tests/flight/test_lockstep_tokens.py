@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -313,23 +313,32 @@ def key(tmp_path: Path) -> Path:
     return path
 
 
+R = TypeVar("R", bound=Relay)
+
+
+def fly_through(kind: type[R], reference: Reference, tmp_path: Path, key: Path) -> R:
+    """Fly both programs, signed, through a relay; fail unless the flight is the reference's."""
+    with staged(reference, StoredSigning(key)) as (stage, ports):
+        far = choose_ports().api
+        words = companion_words(far, ports.camera, reference, "--signing-key", str(key))
+        with (
+            closing(kind(ports.api, far)) as relay,
+            running(words, tmp_path) as companion,
+        ):
+            lanes = fly_staged(stage)
+            assert companion.wait() == 0, companion.text()
+    assert lanes | lanes_in(companion.text()) == reference.lanes
+    return relay
+
+
 @pytest.mark.nightly
 def test_neither_lost_words_nor_a_key_change_the_flight(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:
     """The reference is flown in one process, where there is no wire to sign."""
-    with staged(reference, StoredSigning(key)) as (stage, ports):
-        far = choose_ports().api
-        words = companion_words(far, ports.camera, reference, "--signing-key", str(key))
-        with (
-            closing(Relay(ports.api, far)) as relay,
-            running(words, tmp_path) as companion,
-        ):
-            lanes = fly_staged(stage)
-            assert companion.wait() == 0, companion.text()
+    relay = fly_through(Relay, reference, tmp_path, key)
     assert min(relay.dropped["F"], relay.dropped["D"]) >= 10, relay.dropped
     assert relay.unsigned == 0
-    assert lanes | lanes_in(companion.text()) == reference.lanes
 
 
 @pytest.mark.nightly  # Frame by frame: test_mavlink_signing.py.
@@ -337,16 +346,7 @@ def test_forged_replayed_and_unsigned_frames_change_no_bit_of_the_flight(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:
     """The reference is flown without the attacker, and without a wire."""
-    with staged(reference, StoredSigning(key)) as (stage, ports):
-        far = choose_ports().api
-        words = companion_words(far, ports.camera, reference, "--signing-key", str(key))
-        with (
-            closing(Attacker(ports.api, far)) as attacker,
-            running(words, tmp_path) as companion,
-        ):
-            lanes = fly_staged(stage)
-            assert companion.wait() == 0, companion.text()
-    assert lanes | lanes_in(companion.text()) == reference.lanes
+    attacker = fly_through(Attacker, reference, tmp_path, key)
     sent = attacker.forged.sent
     assert sent.total() >= 10_000
     assert min(sent[how] for how in ("unsigned", "forged", "replayed")) >= 1000

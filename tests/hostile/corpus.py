@@ -2,11 +2,11 @@
 
     python -m tests.hostile.corpus [WORD ...]
 
-prints the outcome of each entry, or of those whose names contain a word. Everything is built when
-it is read; the repository holds no hostile file.
+prints the outcome of each entry, or of entries with a WORD in their names. Entries are built before
+they are read; the repository contains no hostile file.
 """
 
-# Builders are lambdas of several steps over values of any type.
+# Builders are lambdas with several steps and values of any type.
 # mypy: disable-error-code="func-returns-value,misc,arg-type,assignment,import-untyped"
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ZERO, FIFO = "/dev/zero", "FIFO"
 
 @cache
 def _base() -> Path:
-    """Return a folder with a run, kept by this process."""
+    """Return a folder with a run; each process writes one."""
     folder = Path(tempfile.mkdtemp(prefix="hostile-base-"))
     # In a child: the compiler of kernels keeps its memory.
     child = os.fork()
@@ -1295,7 +1295,7 @@ def trainings() -> Iterator[tuple[str, tuple[str, ...], Build]]:
     )
 
 
-# --- folders with modules of the same names as those of the packages
+# --- folders with modules named like the packages
 
 
 def modules(*names: str) -> Build:
@@ -1329,18 +1329,7 @@ def folders() -> Iterator[tuple[str, tuple[str, ...], Build]]:
     yield "folder with modules: report", ("report", "run"), modules(*MODULES)
     yield (
         "folder with modules: a policy",
-        (
-            "evaluate",
-            "sound",
-            "--level",
-            "gym",
-            "--episodes",
-            "1",
-            "--arena",
-            "no-obstacles",
-            "--out",
-            "out",
-        ),
+        tuple(word.replace("{d}/p", "sound") for word in FLY),
         modules(*MODULES),
     )
     yield (

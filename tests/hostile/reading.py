@@ -18,7 +18,7 @@ import psutil
 from matplotlib import get_cachedir
 
 LIMIT_S = 60.0
-"""Maximum processor time of a command [s]: the wall time of a machine that has no other work."""
+"""Maximum processor time of a command [s], equal to the wall time on an idle machine."""
 
 PATIENCE_S = 240.0
 """Timeout of a command that waits [wall s]."""
@@ -27,7 +27,7 @@ LIMIT_BYTES, PROGRAM_BYTES = 1 << 30, 350 << 20
 """Maximum resident memory of a command."""
 
 ADDRESSES = 6 << 30
-"""Maximum address space of a command: a bomb ends it, and not the machine."""
+"""Maximum address space of a command: a bomb ends only the command."""
 
 CODES = (0, 1, 2, 3, 4, 5)
 
@@ -91,7 +91,7 @@ def fingerprint(folder: Path) -> str:
 
 
 def read(entry: Entry, root: Path) -> Result:
-    """Build an entry below a folder, read it with its command, and return what came of it.
+    """Build an entry below a folder, read it with its command, and return the outcome.
 
     `root/outside` is a folder of the user that no entry may change, and its home.
     """
@@ -121,7 +121,7 @@ def read(entry: Entry, root: Path) -> Result:
         problems.append(f"ended by {code}")
     if seconds > LIMIT_S:
         problems.append("too slow")
-    # The child inherits the memory of this process, instead of that of a fresh program.
+    # The child inherits the memory of this process.
     peak = max(0, used.ru_maxrss * 1024 - inherited) + PROGRAM_BYTES
     if peak > LIMIT_BYTES:
         problems.append("too much memory")

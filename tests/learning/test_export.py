@@ -143,7 +143,7 @@ def test_scores_are_those_of_torch_for_any_number_of_rows(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("scaled", [True, False])
 def test_the_graph_scales_the_image_as_sb3_does(scaled: bool, tmp_path: Path) -> None:
-    """uint8 goes in; the network behind must see grey / 255, or grey if it was trained so."""
+    """Images are uint8; the network reads grey / 255, or grey if trained so."""
     model = make_model("DQN", policy_kwargs={"normalize_images": scaled})
     runtime = open_model(tmp_path, export_sb3(model, facts(), tmp_path))
     seen = noise(3)
@@ -313,7 +313,7 @@ def test_a_recurrent_policy_remembers_as_the_model_does(name: str, tmp_path: Pat
     by_torch = load_learned(tmp_path, runtime="torch", trust=True)
     differs = 0
     for flight in range(2):
-        # As the companion has it: an object a flight.
+        # One object per flight, as in the companion.
         policies = [loaded.with_generator(np.random.default_rng(0)) for _ in range(3)]
         together = loaded.with_generator(np.random.default_rng(0))
         trusted = by_torch.with_generator(np.random.default_rng(0))
@@ -391,7 +391,7 @@ Refuse = Callable[..., str]
 
 @pytest.fixture(scope="module")
 def zips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Foreign models, as their `save` writes them."""
+    """Foreign models in the format of their `save`."""
     folder = tmp_path_factory.mktemp("zips")
     make_model("DQN").save(folder / "dqn.zip")
     make_model("SAC", "velocity").save(folder / "sac.zip")
@@ -604,7 +604,7 @@ def test_nothing_is_unpickled_without_trust(
     assert "model.zip: unpickling it can run any code on this machine; accepted: with" in line
     assert not Path("canary").exists()
     assert airl(monkeypatch, *words, "--trust") == 2
-    assert Path("canary").exists()  # The file is one that runs code.
+    assert Path("canary").exists()  # The file does run code.
 
 
 TOLD = """

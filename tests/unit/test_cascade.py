@@ -61,7 +61,7 @@ class Reference:
     rates: Any = (ZERO, 0.0)
     """Published by the attitude loop: rates, collective."""
     gyro: list[list[float]] = field(default_factory=list)
-    """Of each axis: input and output of the low-pass at the last two ticks."""
+    """Input and output of each axis's low-pass at the last two ticks."""
     rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rate_slope: np.ndarray = field(default_factory=lambda: np.zeros(3))
     rate_integral: Any = ZERO

@@ -116,7 +116,7 @@ def of_depth(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Lie:
 
 
 def later(seconds: Callable[[float], float]) -> Lie:
-    """Frames that are older than they should be."""
+    """Frames with an additional delay."""
     return lambda now, then, s: now.seen(
         capture_time_us=now.frame.capture_time_us - round(seconds(s) * US_PER_S)
     )
@@ -168,7 +168,7 @@ def turned(by: Callable[[float], tuple[float, float, float]]) -> Lie:
 
 
 def heading_held(now: Told, then: Told, s: float) -> Told:
-    """Roll and pitch that go on, with the heading of the onset."""
+    """Roll and pitch continue; the heading stays."""
     roll, pitch, _ = quat_to_euler(now.state.quaternion)
     heading = quat_to_euler(then.state.quaternion).yaw
     return now.moved(quaternion=quat_from_euler(roll, pitch, heading))
@@ -283,7 +283,7 @@ LIES: dict[str, tuple[Lie, str, float]] = {
         0.0,
     ),
 }
-"""Each: the lie, why the flight ends, and how long it may go unnoticed [s], one look apart."""
+"""False telemetry, reason of the ending, and maximum time to detection [s], plus one check."""
 
 
 def fly(
@@ -342,7 +342,7 @@ def test_a_lie_ends_the_flight_in_time(name: str, period_s: float) -> None:
         ending, at_s = fly(told, period_s, 60.0, LimitSettings())
         assert ending is not None
         assert ending.reason == reason, str(ending)
-        # A value that stays the same is known to from the look after the one that it began with.
+        # A constant value counts from the second check with it.
         assert begun_s <= at_s <= begun_s + within_s + 2.0 * period_s + 1e-6
 
 

@@ -63,7 +63,7 @@ def messages() -> list[Any]:
     ]
 
 
-def test_pymavlink_accepts_what_is_signed_here() -> None:
+def test_pymavlink_accepts_our_signatures() -> None:
     theirs, ours = peer(), signing()
     plain = dialect.MAVLink(None, 1, 1)
     for message in messages():
@@ -75,7 +75,7 @@ def test_pymavlink_accepts_what_is_signed_here() -> None:
     assert ours.sign(frame, 0) == frame  # Once is enough.
 
 
-def test_what_pymavlink_signs_is_accepted_here() -> None:
+def test_signatures_of_pymavlink_are_accepted() -> None:
     theirs, ours = peer(), signing()
     for message in messages():
         assert ours.accepts(message.pack(theirs))
@@ -86,7 +86,7 @@ def test_every_bit_of_a_signed_frame_counts() -> None:
     frame = messages()[0].pack(peer())
     for position in range(len(frame) * 8):
         if position // 8 == 0:
-            continue  # Without its marker it is no frame.
+            continue  # A frame starts with its marker.
         forged = bytearray(frame)
         forged[position // 8] ^= 1 << position % 8
         assert not signing().accepts(bytes(forged)), position
@@ -98,7 +98,7 @@ def test_nothing_is_taken_twice_or_out_of_order() -> None:
     assert ours.accepts(second)
     assert not ours.accepts(second)
     assert not ours.accepts(first)
-    # Another link id is another stream: the signature covers it.
+    # Each link id is a separate stream; the signature covers it.
     assert ours.accepts(messages()[0].pack(peer(link_id=6)))
     assert ours.refused == 2
 
@@ -128,7 +128,7 @@ def test_unsigned_frames_are_refused_but_for_what_radios_send() -> None:
 
 
 def test_after_one_signed_frame_no_unsigned_one_counts() -> None:
-    """A HEARTBEAT in the name of any system, also one that never signs."""
+    """An unsigned HEARTBEAT of any system is rejected, also of a system without a key."""
     ours = signing()
     beats = [
         messages()[1].pack(dialect.MAVLink(None, system, component), force_mavlink1=old)
@@ -216,7 +216,7 @@ def test_a_key_file_is_for_its_owner_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "12", "zz" * 32, "00" * 32, "11" * 33, "\xff" * 64])
-def test_what_is_no_key_is_refused(tmp_path: Path, text: str) -> None:
+def test_an_unusable_key_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "key"
     path.touch(mode=0o600)
     path.write_text(text)
@@ -244,7 +244,7 @@ def test_key_and_newest_time_stamp_outlive_the_program(tmp_path: Path) -> None:
     late = StoredSigning(path, clock)
     assert late.signing.timestamp == NOW * 3
     assert not late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 2)))
-    # So are those of the last minute: the earlier program may have heard them.
+    # The earlier program may have accepted frames of the last minute.
     assert not late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 3)))
     assert late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 3 + 1)))
     stored.signing.change(OTHER, 7)
@@ -258,7 +258,7 @@ def test_a_time_stamp_that_cannot_be_written_ends_nothing(tmp_path: Path) -> Non
     path = tmp_path / "key"
     write_key(path, KEY)
     stored = StoredSigning(path)
-    (tmp_path / "key.timestamp").mkdir()  # Nothing can take its place.
+    (tmp_path / "key.timestamp").mkdir()  # A folder cannot be replaced by a file.
     stored.save()
     assert stored.signing.key == KEY
 
