@@ -330,16 +330,16 @@ class VehicleLimits:
             return None
         north_m, east_m, down_m = (state.position - rest.position).tolist()
         turn_rad = wrap_pi(quat_yaw(state.quaternion) - quat_yaw(rest.quaternion))
-        asked, height_m = f"the take-off to {self._altitude_m:g} m", -float(state.position[2])
+        takeoff, height_m = f"the take-off to {self._altitude_m:g} m", -float(state.position[2])
         if (shift_m := math.hypot(north_m, east_m)) > TAKEOFF_M:
-            return Ending(TELEMETRY_WRONG, f"{asked} moved the position by {shift_m:.1f} m")
+            return Ending(TELEMETRY_WRONG, f"{takeoff} moved the position by {shift_m:.1f} m")
         if abs(-down_m - self._altitude_m) > TAKEOFF_M:
-            return Ending(TELEMETRY_WRONG, f"{asked} changed the height by {-down_m:.1f} m")
+            return Ending(TELEMETRY_WRONG, f"{takeoff} changed the height by {-down_m:.1f} m")
         if abs(height_m - self._altitude_m) > ORIGIN_M:
-            return Ending(TELEMETRY_WRONG, f"{asked} ended at a height of {height_m:.1f} m")
+            return Ending(TELEMETRY_WRONG, f"{takeoff} ended at a height of {height_m:.1f} m")
         if abs(turn_rad) > TAKEOFF_RAD:
             return Ending(
-                TELEMETRY_WRONG, f"{asked} turned the nose by {math.degrees(turn_rad):.0f} deg"
+                TELEMETRY_WRONG, f"{takeoff} turned the nose by {math.degrees(turn_rad):.0f} deg"
             )
         return None
 

@@ -263,6 +263,12 @@ def package_versions() -> dict[str, str]:
     return found
 
 
+def version_changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Return the versions that differ, as text: "numpy 2.3.1, not 2.3.2"."""
+    names = [name for name in {**new, **old} if old.get(name) != new.get(name)]
+    return [f"{name} {old.get(name)}, not {new.get(name)}" for name in names]
+
+
 def code_of(made: Mapping[str, Any]) -> str:
     """Return the identity of the code from `versions` and `git`: "FINGERPRINT@COMMIT".
 
@@ -310,12 +316,12 @@ def check_code(
     if {code.partition("@")[0] for code in others} == {code_now().partition("@")[0]}:
         say(f"{line}: another commit, the same code of flights")
         return
-    old, now = made.get("versions"), package_versions()
-    if isinstance(old, Mapping) and (changed := [k for k in now if old.get(k) != now[k]]):
-        line += f" ({'; '.join(f'{k} {old.get(k)}, not {now[k]}' for k in changed)})"
+    old = made.get("versions")
+    if isinstance(old, Mapping) and (changed := version_changes(old, package_versions())):
+        line += f" ({'; '.join(changed)})"
     if not mixed:
         raise UsageError(f"{line}; accepted: a new folder, the same code, or --mixed-code")
-    say(f"{line}: goes on with several versions of the code")
+    say(f"{line}: resumed with several versions of the code")
 
 
 def flown_with(codes: Iterable[str | None]) -> str:

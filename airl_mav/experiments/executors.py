@@ -28,7 +28,7 @@ from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import quantity
-from airl_mav.core.machine import package_versions, usable_cores
+from airl_mav.core.machine import package_versions, usable_cores, version_changes
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario import aircraft, model, resolve
 
@@ -152,12 +152,7 @@ class Failure:
 
 def check_versions(driver: Mapping[str, str]) -> None:
     """Raise UsageError if this worker's versions differ from the driver's `package_versions`."""
-    here = package_versions()
-    if different := [
-        f"{name} {here.get(name)}, not {driver.get(name)}"
-        for name in {**driver, **here}
-        if here.get(name) != driver.get(name)
-    ]:
+    if different := version_changes(package_versions(), driver):
         raise UsageError(
             f"the worker on {os.uname().nodename} has other code: {'; '.join(different)}; accepted:"
             " the same versions on every machine, unchanged during the run"
