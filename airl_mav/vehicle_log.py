@@ -154,7 +154,7 @@ _PARTLY_NAN = ("setpoint", "more_than_velocity", "nav_state", "battery")
 """Series in which NaN has a meaning; samples with NaN are removed from all others."""
 
 
-class _LimitedLog(ULog):  # type: ignore[misc]
+class _LimitedLog(ULog):  # type: ignore[misc]  # pyulog has no types
     """Reader that ends for any file: with limits of damaged places, and of a message's fields."""
 
     left = 1_000_000
@@ -166,7 +166,7 @@ class _LimitedLog(ULog):  # type: ignore[misc]
             raise ULogException("too many damaged places")
         return found
 
-    class _MessageAddLogged(ULog._MessageAddLogged):  # type: ignore[misc]
+    class _MessageAddLogged(ULog._MessageAddLogged):  # type: ignore[misc]  # as above
         left = 1 << 16
 
         def _parse_nested_type(self, prefix: str, name: str, formats: Mapping[str, Any]) -> None:
