@@ -244,6 +244,8 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
+    # Child processes import no modules from the current folder (Python 3.11 and later).
+    os.environ["PYTHONSAFEPATH"] = "1"
     try:
         try:
             code = carry_out(prog, module, words)

@@ -72,6 +72,8 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
         for folder in options.runs:
             if kind_of(folder) is None:
                 trust_arenas(load(folder))
+    if not all(map(str.isprintable, options.names)):
+        raise errors.FieldError("names", accepted="printable characters")
     if len(options.runs) > 1 or kind_of(first) == "matrix":
         return _compare(options, console)
     if options.names:

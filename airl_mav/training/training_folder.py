@@ -47,7 +47,7 @@ class Evaluation:
         return self.success_rate, -(self.flight_time_s or 1e9)
 
 
-_EVALUATION = TypeAdapter(Evaluation)
+_EVALUATION, _CONFIG = TypeAdapter(Evaluation), TypeAdapter(TrainingConfig)
 
 
 class TrainingFolder:
@@ -88,7 +88,7 @@ class TrainingFolder:
             raise errors.UsageError(
                 f"{path}: holds a training run already; accepted: another folder, or resume"
             )
-        theirs = TrainingConfig.model_validate(folder.about()["config"])
+        theirs = files.typed(_CONFIG, folder.about()["config"], path / CONFIG_FILE)
         if changed := [
             name
             for name in TrainingConfig.model_fields
