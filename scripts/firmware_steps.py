@@ -1,0 +1,153 @@
+"""Step responses of a flight controller in lockstep, by the true state at every tick.
+
+    python scripts/firmware_steps.py [--px4-dir DIR] [--px4-release 1.17] [--seeds 3] [--json FILE]
+
+Flies the steps of `airl conformance` with a real PX4, or with the built-in flight controller, on the
+same simulated vehicle. A step's time counts from the companion's call of MAVSDK.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from mavsdk.plugins.offboard import VelocityBodyYawspeed, VelocityNedYaw
+
+from airl_mav.addons.conformance import telemetry
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.progress import new_console
+from airl_mav.lockstep.stage import LockstepStage
+from airl_mav.lockstep.vehicle import builtin_vehicle, real_vehicle
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.vehicle.rotation import yaw_of
+from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.simulation import EpisodeSetup, Simulation
+
+ALTITUDE_M, SETTLE_S = 10.0, 6.0
+
+
+@dataclass(frozen=True)
+class Command:
+    """Fly step responses in lockstep."""
+
+    px4_dir: Path | None = None
+    """PX4's build or source tree; None = the built-in flight controller."""
+
+    vehicle: str = "quad"
+    """Vehicle profile."""
+
+    seeds: int = 3
+    """Flights with different sensor noise; every second one is mirrored."""
+
+    instance: int = 0
+    """First instance that is tried."""
+
+    json: Path | None = None
+    """File for the figures."""
+
+
+class Truth:
+    """True motion of a flight."""
+
+    def __init__(self) -> None:
+        self._times: list[Any] = []
+        self._motions: list[Any] = []
+
+    def add(self, simulation: Simulation) -> None:
+        """Add the newest ticks."""
+        self._times.append(simulation.truths["time_us"].copy())
+        self._motions.append(simulation.truths["motion"].copy())
+
+    def motion(self) -> telemetry.EstimatedMotion:
+        """Return the motion in the form of telemetry."""
+        times_s = np.concatenate(self._times)[:, None] / US_PER_S
+        rows = np.concatenate(self._motions)
+        yaws = np.array([yaw_of(tuple(q)) for q in rows[:, QUATERNION]])[:, None]
+        return telemetry.EstimatedMotion(
+            np.hstack([times_s, rows[:, POSITION], rows[:, VELOCITY]]),
+            np.hstack([times_s, yaws, rows[:, RATES][:, 2:]]),
+        )
+
+
+def flown_steps(aircraft: Aircraft, seed: int) -> dict[str, telemetry.StepResponse]:
+    """Return the responses of one flight, by step."""
+    vehicle = load_vehicle(aircraft.vehicle)
+    conducted = real_vehicle(aircraft, vehicle) or builtin_vehicle(SimClock())
+    truth, sent = Truth(), list[tuple[telemetry.HeldSetpoint, float]]()
+    with LockstepStage(vehicle=conducted) as stage:
+
+        def hold(leg: telemetry.HeldSetpoint) -> None:
+            """Send a setpoint and wait."""
+            frame, *values = leg.setpoint
+            offboard: Any = stage.link._offboard  # noqa: SLF001 (the link has no NED setpoints)
+            sent.append((leg, stage.clock.time_us() / US_PER_S))
+            if frame == "ned":
+                offboard.set_velocity_ned(VelocityNedYaw(*values))
+            else:
+                offboard.set_velocity_body(VelocityBodyYawspeed(*values))
+            stage.link.setpoints_sent += 1
+            stage.clock.sleep_until(stage.clock.time_us() + round(leg.seconds * US_PER_S))
+
+        def program() -> None:
+            link, stop = stage.link, threading.Event()
+            link.prepare(20.0, stop)
+            link.arm(60.0, stop)
+            link.takeoff(ALTITUDE_M, 60.0, stop)
+            link.enter_offboard()
+            hold(telemetry.HeldSetpoint(telemetry.STOP_NED, SETTLE_S))
+            for leg in telemetry.plan(telemetry.STEP_NAMES, mirrored=seed % 2 == 0):
+                hold(leg)
+            link.leave_offboard()
+            link.land(120.0)
+
+        stage.firmware.on_ticks = truth.add
+        stage.run(EpisodeSetup(vehicle, None, seed, aircraft=aircraft), program)
+    motion, responses = truth.motion(), {}
+    for leg, sent_s in sent:
+        if leg.step is not None:
+            part = motion.between(sent_s - telemetry.BEFORE_S, sent_s + leg.seconds)
+            responses[leg.step.name] = telemetry.measure(leg.step, part, sent_s)
+    return responses
+
+
+def mean_steps(aircraft: Aircraft, seeds: int) -> dict[str, telemetry.StepResponse]:
+    """Return the mean responses of several flights, by step."""
+    flights = [flown_steps(aircraft, seed) for seed in range(1, seeds + 1)]
+    return {
+        name: telemetry.StepResponse(*np.mean([each[name] for each in flights], axis=0).tolist())
+        for name in flights[0]
+    }
+
+
+def main(command: Command) -> int:
+    """Print the responses."""
+    firmware = {} if command.px4_dir is None else {"firmware": "px4"}
+    aircraft = Aircraft(
+        vehicle=command.vehicle,
+        real={"px4_dir": command.px4_dir, "instance": command.instance},
+        **firmware,
+    )
+    found = mean_steps(aircraft, command.seeds)
+    console = new_console(soft_wrap=True)
+    for name, step in found.items():
+        console.print(
+            f"{name:14} latency {1e3 * step.latency_s:4.0f} t10 {1e3 * step.t10_s:4.0f} t50 "
+            f"{1e3 * step.t50_s:5.0f} rise {1e3 * step.rise_s:5.0f} ms  overshoot "
+            f"{step.overshoot_percent:5.1f} %  error {step.error:5.2f}  settle {step.settle_s:4.2f} s"
+        )
+    if command.json is not None:
+        plain = {name: step._asdict() for name, step in found.items()}
+        command.json.write_text(json.dumps(plain, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Command)))
