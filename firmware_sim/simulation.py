@@ -154,7 +154,7 @@ def builtin_autopilot(setup: EpisodeSetup, keeper: Keeper | None = None) -> Buil
     overrides = dict(setup.vehicle.autopilot_parameters())
     if instance := setup.aircraft.real.instance:
         overrides["MAV_SYS_ID"] = instance + 1  # as PX4 SITL's rcS sets it
-    parameters = Parameters(overrides, keeper)
+    parameters = Parameters(overrides, keeper, setup.vehicle.px4_release)
     if setup.aircraft.estimator == "kernel":
         return BuiltinAutopilot(parameters)
     # FilterPy's filter, equal up to rounding. Imported late, as it imports scipy.stats.

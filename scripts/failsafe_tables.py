@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from airl_mav.profiles.parameters import SPEC_BY_NAME
+from airl_mav.profiles.px4_release import px4_release
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.events.definition import FailsafeAction, words
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
@@ -58,7 +58,7 @@ def _failsafe(row: Row) -> Sequence[str]:
     if row.parameter is None:
         action = ACTION_NAMES[row.answers[0].action]
     else:
-        default = int(SPEC_BY_NAME[row.parameter].default)
+        default = int(px4_release().spec_by_name[row.parameter].default)
         choices = ", ".join(
             _choice(value, options, default) for value, options in sorted(row.answers.items())
         )
@@ -75,7 +75,7 @@ def _failsafe(row: Row) -> Sequence[str]:
 def _shown(row: Row) -> Options | None:
     """Return the response listed with its end: the default, or the mildest active one."""
     # Prefer the default; else Return, else any active response.
-    value = 0 if row.parameter is None else int(SPEC_BY_NAME[row.parameter].default)
+    value = 0 if row.parameter is None else int(px4_release().spec_by_name[row.parameter].default)
     acting = [options for options in row.answers.values() if options.action > FailsafeAction.WARN]
     chosen = row.answers.get(value)
     if chosen is not None and chosen.action > FailsafeAction.WARN:
@@ -90,14 +90,14 @@ def _choice(value: int, options: Options, default: int) -> str:
 
 
 def _parameter(name: str) -> str:
-    spec = SPEC_BY_NAME[name]
+    spec = px4_release().spec_by_name[name]
     unit = f" {spec.unit}" if spec.unit else ""
     return f"`{name}` {spec.default:g}{unit}"
 
 
 def offboard_loss() -> str:
     """Return the replacements of Offboard after setpoint loss."""
-    default = int(SPEC_BY_NAME["COM_OBL_RC_ACT"].default)
+    default = int(px4_release().spec_by_name["COM_OBL_RC_ACT"].default)
     rows = (
         (f"**{value}**" if value == default else f"{value}", ACTION_NAMES[action])
         for value, action in OFFBOARD_LOSS.items()

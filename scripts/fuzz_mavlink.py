@@ -26,7 +26,7 @@ import tyro
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
@@ -61,7 +61,7 @@ CLIMB_TICKS = 500
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, 1e-30, 47.4, 8.5)
 
-PARAMETERS = tuple(spec.name.encode() for spec in SPECS)
+PARAMETERS = tuple(spec.name.encode() for spec in px4_release().specs)
 
 KNOWN: Mapping[str, tuple[int, ...]] = {
     "target_system": (1, 1, 1, 1, 1, 1, 1, 1, 1, 0),

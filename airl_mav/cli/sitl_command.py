@@ -130,6 +130,7 @@ def conclude(
 def _announce(scenario: ResolvedScenario, console: Console) -> None:
     asked, setup = scenario.scenario, scenario.setup
     _say(console, f"airl-sitl  {asked.vehicle} in {asked.arena}, policy {scenario.policy.name}")
+    _say(console, f"firmware   {setup.firmware}")
     if asked.level != "sitl":
         _say(console, "lockstep   one process, one simulated clock, MAVSDK on raw bytes")
         if setup.level != "firmware":
@@ -139,10 +140,8 @@ def _announce(scenario: ResolvedScenario, console: Console) -> None:
         if asked.renderer in SLOW:
             _say(console, "camera     path traced in real time: images are as late as they take")
     _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
-    if setup.level == "firmware":
-        _say(console, f"firmware   {setup.firmware}")
-        if (hint := how_to_start(asked, scenario.vehicle)) is not None:
-            _say(console, f"           start one for every flight: {hint}")
+    if setup.level == "firmware" and (hint := how_to_start(asked, scenario.vehicle)) is not None:
+        _say(console, f"           start one for every flight: {hint}")
 
 
 def _say(console: Console, text: str) -> None:

@@ -54,7 +54,6 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.prediction import Compensator
 from airl_mav.profiles import camera, loading, projections
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
-from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import Payload, VehicleProfile, check_spread, equipped
 from airl_mav.vehicle.airframe import draw_airframe, spreads
 
@@ -155,7 +154,7 @@ class Navigation(Stateful):
             raise FieldError("goal_height", True, accepted)
         self.injections = injections_of(spec.delay) if injection is None else (injection,)
         self._trace = trace
-        parameters = flown_values(self.vehicle.autopilot_parameters())
+        parameters = self.vehicle.flown_parameters()
         self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__, computer_w)
         self._charge = battery_charge
         rules = spec.episode

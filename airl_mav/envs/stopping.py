@@ -27,7 +27,6 @@ from airl_mav.envs.spec import Delay, EnvironmentSpec
 from airl_mav.latency.injection import Injection, choose_injection, longest_ms, parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import profile_digest
-from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import Payload, VehicleProfile, equipped
 
 SCHEMA = 1
@@ -170,7 +169,7 @@ def measure_braking(vehicle: VehicleProfile) -> Braking:
 
 def gym_constants_of(vehicle: VehicleProfile) -> FleetConstants:
     """Return the vectorized simulator's constants of a vehicle, with the vehicle's parameters."""
-    return vehicle_of(vehicle, flown_values(vehicle.autopilot_parameters()).__getitem__)
+    return vehicle_of(vehicle, vehicle.flown_parameters().__getitem__)
 
 
 def open_space(n: int, obstacles: int = 0) -> ArenaBatch:

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile
 
 
@@ -45,7 +44,7 @@ def max_acceleration(vehicle: VehicleProfile) -> float:
     The minimum of two limits: the autopilot's tilt limit, g tan(tilt), and the thrust, sqrt((F /
     m)² - g²).
     """
-    tilt_max_deg = flown_values(vehicle.parameters)["MPC_TILTMAX_AIR"]
+    tilt_max_deg = vehicle.flown_parameters()["MPC_TILTMAX_AIR"]
     lift = vehicle.thrust_n / vehicle.body.mass_kg
     by_thrust = math.sqrt(lift**2 - GRAVITY_M_S2**2)
     return min(GRAVITY_M_S2 * math.tan(tilt_max_deg * DEG), by_thrust)

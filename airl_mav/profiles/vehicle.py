@@ -18,7 +18,7 @@ from airl_mav.core.frames import HOME, Geodetic
 from airl_mav.profiles.camera import Camera, FurtherCameras, check_rates, with_the_rate
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.parameters import SPECS, parameter_values
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName, px4_release
 
 
 class WindSettings(ProfileModel):
@@ -156,11 +156,14 @@ def loaded(
 
 
 def equipped(
-    vehicle: str, computer: str, payload: Payload
+    vehicle: str, computer: str, payload: Payload, release: PX4ReleaseName | None = None
 ) -> tuple[VehicleProfile, ComputerProfile]:
-    """Return a vehicle, `loaded`, and its computer, by names or paths. Raises UsageError."""
+    """Return a vehicle, `loaded`, and its computer, by names or paths. Raises UsageError.
+
+    `release` replaces the vehicle's PX4 release; None = as in its profile.
+    """
     board = load_computer(computer)
-    return loaded(load_vehicle(vehicle), board, payload), board
+    return loaded(load_vehicle(vehicle, release), board, payload), board
 
 
 def check_spread(vehicle: VehicleProfile, spread: Spread, table: str = "spread") -> None:
@@ -561,6 +564,9 @@ class VehicleProfile(ProfileModel):
         "how it answers velocity setpoints; absent = not known: its decisions' latency"
         " cannot be compensated"
     )
+    px4_release: PX4ReleaseName = Field(
+        default=CURRENT, description="PX4 release that the built-in autopilot emulates"
+    )
     parameters: ParameterTable = Field(
         default_factory=dict,
         description="PX4-named parameters of the built-in autopilot that differ from the defaults",
@@ -618,16 +624,22 @@ class VehicleProfile(ProfileModel):
 
     def autopilot_parameters(self) -> dict[str, float]:
         """Return the built-in autopilot's parameters: its rotor positions, and `parameters`."""
-        known = {spec.name for spec in SPECS}
+        known = px4_release(self.px4_release).spec_by_name
         places = {n: v for n, v in self.rotor.px4_geometry().items() if n in known}
         return {**places, **self.parameters}
 
+    def flown_parameters(self) -> dict[str, float]:
+        """Return all values in flight of the built-in autopilot's parameters."""
+        return px4_release(self.px4_release).flown_values(self.autopilot_parameters())
 
-def load_vehicle(name: str) -> VehicleProfile:
-    """Return a vehicle profile by name or path, or raise UsageError."""
+
+def load_vehicle(name: str, release: PX4ReleaseName | None = None) -> VehicleProfile:
+    """Return a vehicle profile by name or path, with another PX4 release. Raises UsageError."""
     vehicle = load_profile("vehicles", name, VehicleProfile)
+    if release is not None:
+        vehicle = vehicle.model_copy(update={"px4_release": release})
     try:
-        parameter_values(vehicle.parameters)
+        px4_release(vehicle.px4_release).parameter_values(vehicle.parameters)
     except UsageError as error:
         raise UsageError(f"vehicle {name}: {error}") from None
     return vehicle

@@ -307,7 +307,7 @@ def fly_vehicle(
 
 def aircraft_of(asked: stand_alone.StandAloneVehicle) -> tuple[VehicleProfile, float]:
     """Return the loaded vehicle and its computer's power [W]. Raises UsageError."""
-    vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
+    vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload, asked.px4_release)
     check_spread(vehicle, asked.spread)
     further = vehicle.cameras.values()
     check_noise(vehicle.camera, asked.sensors, asked.faults, further=further)

@@ -11,6 +11,7 @@ from pydantic import Field
 from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switch
 from airl_mav.faults import Fault
 from airl_mav.profiles.projections import Renderer
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
 from airl_mav.profiles.vehicle import Payload, SensorNoise, Spread, WindSettings
 
 VehicleName = Annotated[
@@ -160,6 +161,10 @@ class Aircraft(ProfileModel):
         default="builtin",
         description="flight controller: the built-in one, or real firmware on this vehicle and its"
         " sensors; see docs/how-to/real-firmware.md",
+    )
+    px4_release: Annotated[PX4ReleaseName | None, "firmware and links"] = optional(
+        "PX4 release that the built-in flight controller emulates: parameters, gains and failsafes;"
+        f" by default as the vehicle's profile says, or {CURRENT}"
     )
     real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
     signing_key: Annotated[Path | None, FREE, "firmware and links"] = optional(

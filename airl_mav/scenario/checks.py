@@ -144,6 +144,8 @@ def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str |
             raise FieldError("firmware", firmware, f"with {' or '.join(names)}")
     if firmware == "builtin":
         return
+    if asked.px4_release is not None:
+        raise FieldError("px4_release", asked.px4_release, "with firmware builtin")
     if level == "gym":
         raise FieldError(
             "firmware", firmware, "at level lockstep or sitl: the vectorized simulator has its own"

@@ -30,7 +30,6 @@ from airl_mav.prediction import Compensator
 from airl_mav.profiles import camera, loading, projections
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
-from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile, check_spread, equipped
 from airl_mav.scenario import checks
 from airl_mav.scenario.aircraft import FirmwareName, PlantName
@@ -94,7 +93,9 @@ def resolve(scenario: Scenario, policy: registry.PolicyInfo | None = None) -> Re
     policy = policy or registry.find_policy(scenario.policy, trust=scenario.trust)
     checks.check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
     pilot, watchdog = checks.decide_piloting(scenario, policy, judge.GOAL_RADIUS_M)
-    vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
+    vehicle, computer = equipped(
+        scenario.vehicle, scenario.computer, scenario.payload, scenario.px4_release
+    )
     check_spread(vehicle, scenario.spread)
     further = vehicle.cameras.values()
     camera.check_noise(vehicle.camera, scenario.sensors, scenario.faults, further=further)
@@ -148,7 +149,7 @@ ARRIVAL_SHARE = 0.8
 referee the true one."""
 
 FIRMWARE_TITLES: dict[FirmwareName, str] = {
-    "builtin": episode_record.BUILT_IN,
+    "builtin": f"{episode_record.BUILT_IN}, as PX4 {{release}}",
     "px4": "PX4 SITL",
     "ardupilot": "ArduPilot SITL",
     "px4-hitl": "PX4 on a board",
@@ -212,6 +213,7 @@ class ResolvedScenario:
         return {
             **anchored(self.scenario).model_dump(mode="json", exclude=set(pilot)),
             "speed": self.speed,
+            "px4_release": self.vehicle.px4_release,
             "pilot": pilot,
             "watchdog": self.watchdog.model_dump(mode="json"),
             # The body includes the load, which the profile lacks.
@@ -258,8 +260,8 @@ class ResolvedScenario:
             return 0.0
         if self.scenario.start == "hover":
             return HOVER_START_S
-        parameters = flown_values(self.vehicle.autopilot_parameters())
-        return BEFORE_CLIMB_S + self.pilot.altitude_m / parameters["MPC_TKO_SPEED"]
+        climb_m_s = self.vehicle.flown_parameters()["MPC_TKO_SPEED"]
+        return BEFORE_CLIMB_S + self.pilot.altitude_m / climb_m_s
 
     def arena_of(self, seed: int) -> Arena:
         """Return the arena of the episode of a seed. Raises UsageError if generation fails.
@@ -300,7 +302,7 @@ class ResolvedScenario:
         without = f" (its input {scenario.ablate!r} made zero)" if scenario.ablate else ""
         return episode_record.Setup(
             level=self.level,
-            firmware=FIRMWARE_TITLES[scenario.firmware],
+            firmware=FIRMWARE_TITLES[scenario.firmware].format(release=self.vehicle.px4_release),
             vehicle=episode_record.Part(scenario.vehicle, self.vehicle.description),
             arena=episode_record.Part(scenario.arena, self.arena.description),
             policy=episode_record.Part(self.policy.name, f"{self.policy.description}{without}"),

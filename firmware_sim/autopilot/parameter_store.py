@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName, px4_release
 from firmware_sim.autopilot import autopilot_state
 
-_INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
 FLOAT32_RELATIVE = 1e-6
 """Relative difference up to which values are equal after float32 transfer over MAVLink."""
 
@@ -38,17 +37,22 @@ class Parameters:
         self,
         overrides: Mapping[str, int | float] | None = None,
         keeper: Keeper | None = None,
+        release: PX4ReleaseName = CURRENT,
     ) -> None:
         """Start from the defaults.
 
         `overrides` of a vehicle profile, checked by `parameter_values`, are this vehicle's
         defaults. `keeper` stores the user's values; unknown names and values of the wrong type are
-        ignored. Raises UsageError for an invalid override, or if the storage cannot be read.
+        ignored. `release` is the PX4 release whose parameters these are. Raises UsageError for an
+        invalid override, or if the storage cannot be read.
         """
-        values = parameter_values(overrides or {})
+        self.release = px4_release(release)
+        """PX4 release of the parameters."""
+        self._index = {spec.name: i for i, spec in enumerate(self.release.specs)}
+        values = self.release.parameter_values(overrides or {})
         self._defaults = dict(values)
         self._values = list(values.values())
-        self._flown = flown_values(overrides or {})
+        self._flown = self.release.flown_values(overrides or {})
         self.value: Callable[[str], float] = self._flown.__getitem__
         """Look-up of values clipped for flight, fast enough for a call in every tick. Raises
         KeyError if the name is unknown."""
@@ -83,7 +87,7 @@ class Parameters:
 
     def __len__(self) -> int:
         """Return the number of parameters."""
-        return len(SPECS)
+        return len(self.release.specs)
 
     def __getitem__(self, name: str) -> float:
         """Return a value clipped for flight. Raises KeyError for an unknown name."""
@@ -91,14 +95,14 @@ class Parameters:
 
     def by_name(self, name: str) -> ParameterValue | None:
         """Return a parameter as stored, or None if the name is unknown."""
-        index = _INDEX.get(name)
+        index = self._index.get(name)
         return None if index is None else self.by_index(index)
 
     def by_index(self, index: int) -> ParameterValue | None:
         """Return a parameter as stored, or None if the index is out of range."""
-        if not 0 <= index < len(SPECS):
+        if not 0 <= index < len(self.release.specs):
             return None
-        return ParameterValue(SPECS[index].name, self._values[index], index)
+        return ParameterValue(self.release.specs[index].name, self._values[index], index)
 
     def set(self, name: str, value: int | float) -> ParameterValue | None:
         """Store a value as given; return the stored parameter, or None if the name is unknown.
@@ -153,10 +157,10 @@ class Parameters:
             listener()
 
     def _store(self, name: str, value: int | float) -> bool:
-        index = _INDEX.get(name)
+        index = self._index.get(name)
         if index is None or not math.isfinite(value):
             return False
-        spec = SPECS[index]
+        spec = self.release.specs[index]
         # The default's type decides: INT32 values are truncated.
         stored = type(spec.default)(value)
         if isinstance(stored, int) and not _INT32_LOW <= stored <= _INT32_HIGH:
@@ -166,7 +170,7 @@ class Parameters:
         self._values[index] = stored
         self.revision += 1
         # Flight code reads the clipped value, clients the stored one.
-        self._flown[name] = spec.flown(stored)
+        self._flown[spec.current_name] = spec.flown(stored)
         if not self._is_bounded(name):
             self._bounded.discard(name)
         elif name not in self._bounded:
@@ -175,13 +179,14 @@ class Parameters:
         return True
 
     def _is_bounded(self, name: str) -> bool:
-        stored = self._values[_INDEX[name]]
-        return SPEC_BY_NAME[name].is_used and not math.isclose(
-            self._flown[name], stored, rel_tol=FLOAT32_RELATIVE
+        stored, spec = self._values[self._index[name]], self.release.spec_by_name[name]
+        return spec.is_used and not math.isclose(
+            self._flown[spec.current_name], stored, rel_tol=FLOAT32_RELATIVE
         )
 
     def _bounded_text(self, name: str) -> autopilot_state.OperatorText:
-        value, flown = self._values[_INDEX[name]], self._flown[name]
+        value = self._values[self._index[name]]
+        flown = self._flown[self.release.spec_by_name[name].current_name]
         return autopilot_state.OperatorText(
             autopilot_state.Severity.WARNING, f"{name} {value:g} is flown as {flown:g}"
         )

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 from airl_mav.core import errors, files
-from airl_mav.profiles.parameters import SPEC_BY_NAME
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE, Corner, VehicleProfile
 from firmware_sim.interfaces import FirmwareMissingError
 
@@ -48,8 +47,6 @@ class KeptParameters:
     def read(self) -> dict[str, int | float]:
         """Return the stored parameters; {} without a file.
 
-        PX4 parameters that the built-in flight controller lacks are omitted.
-
         Raises:
             UsageError: The file cannot be read, or is not a parameter file.
         """
@@ -65,16 +62,13 @@ class KeptParameters:
                 continue
             columns = line.split("\t")
             try:
-                _, _, name, text, _ = columns
-                spec = SPEC_BY_NAME.get(name)
-                value = int(text) if spec and isinstance(spec.default, int) else float(text)
+                _, _, name, text, kind = columns
+                values[name] = int(text) if int(kind) == _INT32 else float(text)
             except ValueError:
                 raise errors.UsageError(
                     f"{self._path}: line {number}: accepted: {_COLUMNS} columns between tabs, "
                     f"vehicle, component, name, value, type; has {line!r}"
                 ) from None
-            if spec is not None:
-                values[name] = value
         return values
 
     def write(self, values: Mapping[str, int | float]) -> None:

@@ -17,7 +17,7 @@ from pyulog.px4 import PX4ULog
 from airl_mav import Scenario, load_run, rehearse
 from airl_mav.core.constants import TICK_US
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.addons.flight_log.flight_log import GRID_US
 from firmware_sim.addons.flight_log.topics import TOPICS
@@ -201,7 +201,7 @@ def test_states_texts_and_parameters(flown: tuple[Path, ULog]) -> None:
     assert "Takeoff detected" in texts
     assert texts[-1] == "Disarmed by landing"
     vehicle = load_profile("vehicles", "quad", VehicleProfile)
-    stored = parameter_values(vehicle.autopilot_parameters())
+    stored = px4_release().parameter_values(vehicle.autopilot_parameters())
     assert log.initial_parameters.keys() == stored.keys()
     assert all(
         log.initial_parameters[name] == pytest.approx(value, rel=1e-6)

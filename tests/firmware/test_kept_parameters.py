@@ -12,6 +12,7 @@ import pytest
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.scenario.aircraft import RealFirmware
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.parameters import KeptParameters
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import dialect
@@ -131,7 +132,9 @@ def test_values_survive_the_file(tmp_path: Path) -> None:
 def test_names_that_are_lacking_here_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "a.params"
     path.write_text("# by QGroundControl\n\n1\t1\tNO_SUCH\t1\t6\n1\t1\tSDLOG_MODE\t2\t6\n")
-    assert KeptParameters(path).read() == {"SDLOG_MODE": 2}
+    kept = KeptParameters(path)
+    assert kept.read() == {"NO_SUCH": 1, "SDLOG_MODE": 2}
+    assert Parameters({}, kept).changed() == {"SDLOG_MODE": 2}
 
 
 @pytest.mark.parametrize("line", ["MPC_XY_P 1", "1\t1\tMPC_XY_P\tx\t9", "1\t1\tSDLOG_MODE\t1.5\t6"])

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mavsdk.plugins.ftp import Ftp, FtpError, FtpResult
 from pymavlink import mavftp, mavutil
 
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.px4_release import px4_release
 from firmware_sim.addons.ground_station_services.files import DATA_BYTES, Storage
 from firmware_sim.addons.ground_station_services.ftp import BURST_MESSAGES
 from firmware_sim.mavlink.codec import crc32part, dialect
@@ -191,7 +191,7 @@ def test_the_component_metadata_describes_every_parameter(card: Card) -> None:
     of_events = entries[dialect.COMP_METADATA_TYPE_EVENTS]
     assert crc32part(fetched(of_events["uri"])) == of_events["fileCrc"]
     described = {p["name"]: p for p in json.loads(lzma.decompress(parameters))["parameters"]}
-    assert described.keys() == {spec.name for spec in SPECS}
+    assert described.keys() == {spec.name for spec in px4_release().specs}
     assert described["MPC_XY_VEL_MAX"] | {"shortDesc": ""} == {
         "name": "MPC_XY_VEL_MAX", "type": "Float", "default": 12.0, "min": 0.0, "max": 20.0,
         "units": "m/s", "group": "MPC", "shortDesc": "",

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import EARTH_RADIUS_M, GRAVITY_M_S2, TICK_US, US_PER_S
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.px4_release import px4_release
 from firmware_sim.autopilot.autopilot_state import Arming, Health, Landed, Setpoint
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.snapshot import AutopilotState
@@ -424,7 +424,7 @@ def test_where_an_automatic_mode_is_going() -> None:
 
 
 def test_how_long_the_way_home_takes() -> None:
-    lookup = {spec.name: float(spec.default) for spec in SPECS}.__getitem__
+    lookup = {spec.name: float(spec.default) for spec in px4_release().specs}.__getitem__
     autopilot = flown()
     assert time_estimate_to_target(autopilot.state(), lookup) == (0, -1, -1, -1, -1)
     autopilot.landed = Landed.IN_AIR

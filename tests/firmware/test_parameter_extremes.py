@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from airl_mav.profiles.parameters import SPECS, ParameterSpec
+from airl_mav.profiles.px4_release import ParameterSpec, px4_release
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -58,7 +58,7 @@ def fly_at(rig: Rig, spec: ParameterSpec, value: float) -> None:
     rig.ap.parameters.set(spec.name, usual)
 
 
-USED = [spec for spec in SPECS if spec.is_used]
+USED = [spec for spec in px4_release().specs if spec.is_used]
 GROUPS = [USED[i : i + 8] for i in range(0, len(USED), 8)]
 AT_ONCE = {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
 

@@ -32,7 +32,7 @@ from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.prediction import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.comparison import show
 from airl_mav.scenario.model import LevelName, PilotSettings, Scenario, WatchdogSettings
@@ -47,7 +47,7 @@ from tests.support.command_line import airl
 from tests.support.lockstep_kit import SEED, demo_scenario
 
 QUAD = load_vehicle("quad")
-VEHICLE = vehicle_of(QUAD, parameter_values(QUAD.parameters).__getitem__)
+VEHICLE = vehicle_of(QUAD, px4_release().parameter_values(QUAD.parameters).__getitem__)
 LENS = Intrinsics.of(QUAD.camera)
 TICK_US, PERIOD_US = 4000, 33_333
 ARENA, ARENA_SEED, ALTITUDE_M = "static-obstacles", 7, 2.5

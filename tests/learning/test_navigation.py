@@ -29,7 +29,7 @@ from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.frame_source import ReceivedFrame
@@ -38,7 +38,7 @@ from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 
 QUAD = load_vehicle("quad")
-VEHICLE = vehicle_of(QUAD, parameter_values(QUAD.parameters).__getitem__)
+VEHICLE = vehicle_of(QUAD, px4_release().parameter_values(QUAD.parameters).__getitem__)
 TRUE_STATE = {"navigation_noise": 0.0}
 TICK_US = 4000
 PERIOD_US = 33_333

@@ -17,7 +17,7 @@ import numpy as np
 from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, wrap_pi
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.px4_release import px4_release
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
     Arming,
@@ -123,7 +123,7 @@ class Parameters:
 
     @property
     def value(self) -> Callable[[str], float]:
-        defaults = {spec.name: float(spec.default) for spec in SPECS}
+        defaults = {spec.name: float(spec.default) for spec in px4_release().specs}
         return (defaults | self.values).__getitem__
 
     @property

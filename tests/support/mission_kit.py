@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.addons.missions.executor import MissionExecutor
 from firmware_sim.addons.missions.feasibility import FeasibilityResult, check
@@ -19,7 +19,7 @@ from firmware_sim.autopilot.navigation.plan import MissionType, NavigationState,
 
 NAN = math.nan
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
-DEFAULTS = {spec.name: float(spec.default) for spec in SPECS}
+DEFAULTS = {spec.name: float(spec.default) for spec in px4_release().specs}
 
 
 def place(north: float, east: float, up: float = 0.0, origin: Geodetic = ORIGIN) -> Geodetic:

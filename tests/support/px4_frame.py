@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.autopilot.parameter_store import Parameters, ParameterValue
 
@@ -31,7 +31,7 @@ class Px4Parameters(Parameters):
             px, py, km = FRAME[SWAPPED[i] if swapped else i]
             frame |= {f"CA_ROTOR{i}_PX": px, f"CA_ROTOR{i}_PY": py, f"CA_ROTOR{i}_KM": km}
             frame[outputs.format(i + 1)] = 101 + i
-        own = [spec.name for spec in SPECS]
+        own = [spec.name for spec in px4_release().specs]
         wanted = {} if vehicle.px4 is None else vehicle.px4.parameters
         # Parameters set by a vehicle exist, with another value before.
         self._more = frame | {n: type(v)(0) for n, v in wanted.items() if n not in own}

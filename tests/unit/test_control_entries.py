@@ -9,10 +9,10 @@ import pytest
 
 from airl_mav.control.demand import AttitudeDemand, Demand, Gains, RateDemand, TrajectoryDemand
 from airl_mav.core.constants import GRAVITY_M_S2
-from airl_mav.profiles.parameters import flown_values
+from airl_mav.profiles.px4_release import px4_release
 from firmware_sim.engine.controller import Controller
 
-GAINS = Gains.from_parameters(flown_values({}).__getitem__)
+GAINS = Gains.from_parameters(px4_release().flown_values({}).__getitem__)
 NAN3 = (math.nan, math.nan, math.nan)
 ZERO = (0.0, 0.0, 0.0)
 LEVEL = (1.0, 0.0, 0.0, 0.0)

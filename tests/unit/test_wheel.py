@@ -50,7 +50,7 @@ def test_everything_needed_is_inside(unpacked: Path) -> None:
     }
     assert profiles
     assert profiles <= inside
-    assert "airl_mav/profiles/parameters.csv" in inside
+    assert "airl_mav/_profiles/px4/1.17/parameters.csv" in inside
     assert "airl_mav/report/templates/report.html.j2" in inside
     for package in ("airl_mav", "companion", "firmware_sim"):
         sources = {

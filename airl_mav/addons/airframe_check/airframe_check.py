@@ -18,7 +18,6 @@ from airl_mav.core.files import read_limited
 from airl_mav.envs import fleet, fleet_step, stopping
 from airl_mav.flight.energy import level_powers_w
 from airl_mav.profiles.loading import MOST_BYTES
-from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import CORNERS, Payload, VehicleProfile, equipped
 from airl_mav.report import document
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
@@ -297,7 +296,7 @@ def _motor_points(profile: VehicleProfile) -> list[MotorPoint]:
 
 
 def _warnings(profile: VehicleProfile, found: AirframeFigures) -> list[str]:
-    built_in = flown_values(profile.autopilot_parameters())["MPC_THR_HOVER"]
+    built_in = profile.flown_parameters()["MPC_THR_HOVER"]
     lines = []
     hovers = [("parameters", built_in, found.hover_throttle)]
     if profile.px4 is not None:

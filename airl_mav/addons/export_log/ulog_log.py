@@ -16,7 +16,8 @@ from airl_mav.addons.view.replayed_flight import INFO, STANDING_M, WARNING
 from airl_mav.core.frames import quat_from_euler, quats_to_euler
 from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
-from firmware_sim.addons.flight_log.flight_log import DESCRIBED
+from airl_mav.profiles.px4_release import px4_release
+from firmware_sim.addons.flight_log.flight_log import described
 from firmware_sim.addons.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
 from firmware_sim.addons.flight_log.ulog_writer import Topic, UlogWriter, Values
 from firmware_sim.autopilot.flight_modes import Mode
@@ -59,9 +60,8 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
     """Write a flight as ULog; times are shifted if the path starts before time 0."""
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
-    writer = UlogWriter(
-        path, began_us + later_us, EXPORTED, (("sys_name", "airl-mav export-log"), *DESCRIBED), ()
-    )
+    facts = (("sys_name", "airl-mav export-log"), *described(px4_release().flight_sw_version))
+    writer = UlogWriter(path, began_us + later_us, EXPORTED, facts, ())
     try:
         texts = [(time_us, "", (severity, words)) for time_us, severity, words in _texts(flight)]
         rows: list[tuple[int, str, Any]] = [*samples(flight), *texts]

@@ -24,7 +24,7 @@ from airl_mav.profiles.computer import (
     Workload,
     write_samples,
 )
-from airl_mav.profiles.parameters import SPECS, parameter_values
+from airl_mav.profiles.px4_release import px4_release
 from airl_mav.profiles.vehicle import VehicleProfile
 
 DIGITS = 4
@@ -93,11 +93,12 @@ def identified_profile(profile: VehicleProfile, overrides: Sequence[Override]) -
 
 def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Override]:
     """Return the flight controller's changed gains and limits, without out-of-range values."""
-    held = parameter_values(profile.parameters)
+    release = px4_release(profile.px4_release)
+    held = release.parameter_values(profile.parameters)
     remark = "as the flight controller's log has it"
     return [
         Override("parameters", spec.name, _round(logged[spec.name]), remark)
-        for spec in SPECS
+        for spec in release.specs
         if spec.is_used
         and spec.name.startswith(TUNED)
         and spec.low <= logged.get(spec.name, math.nan) <= spec.high

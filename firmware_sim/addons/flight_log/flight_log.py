@@ -84,18 +84,18 @@ class FlownState:
 GRID_US = 5 * constants.TICK_US
 """Interval of checks for due topics [µs]; all topic intervals are multiples of it."""
 
-_PX4_RELEASE = 1 << 24 | 16 << 16 | 0 << 8 | 255
-"""ver_sw_release: emulated PX4 release, 1.16.0."""
-
 _DATA_FORMAT = 2
-"""ver_data_format: selects the field names in Flight Review, here for PX4 1.16."""
+"""ver_data_format: selects the field names in Flight Review, the same for PX4 1.16 to 1.18."""
 
-DESCRIBED = (
-    ("ver_hw", "PX4_SITL"),
-    ("ver_sw_release", _PX4_RELEASE),
-    ("ver_data_format", _DATA_FORMAT),
-)
-"""Vehicle information by ULog key, in addition to the name."""
+
+def described(flight_sw_version: int) -> tuple[tuple[str, str | int], ...]:
+    """Return vehicle information by ULog key, in addition to the name."""
+    return (
+        ("ver_hw", "PX4_SITL"),
+        ("ver_sw_release", flight_sw_version),
+        ("ver_data_format", _DATA_FORMAT),
+    )
+
 
 _SAMPLES = 0
 """Number of `SENSOR_COMBINED` in the file, before the topics of `TOPICS` in order."""
@@ -134,7 +134,7 @@ class UlogFlightLog:
             path,
             start_us,
             (topics.SENSOR_COMBINED, *(logged.topic for logged in topics.TOPICS)),
-            (("sys_name", "airl-mav"), *DESCRIBED),
+            (("sys_name", "airl-mav"), *described(parameters.release.flight_sw_version)),
             self._known.items(),
             on_lost,
         )

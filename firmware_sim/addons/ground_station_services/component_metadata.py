@@ -18,7 +18,7 @@ from dataclasses import replace
 from typing import Any
 
 from airl_mav.core.addons import entries, load
-from airl_mav.profiles.parameters import SPECS, ParameterSpec
+from airl_mav.profiles.px4_release import ParameterSpec, PX4ReleaseName, px4_release
 from firmware_sim.addons.ground_station_services.files import Storage
 from firmware_sim.autopilot import autopilot_state, flight_modes, prearm
 from firmware_sim.autopilot.events import flight_events, health_report
@@ -41,10 +41,11 @@ _EVENTS = "all_events.json.xz"
 
 
 @functools.cache
-def files() -> dict[str, bytes]:
-    """Return the files by name. Created on first use."""
+def files(release: PX4ReleaseName) -> dict[str, bytes]:
+    """Return the files of a PX4 release by name. Created on first use."""
     # The general file contains the checksums of the others, so it comes last.
-    parameters = _compressed({"version": 1, "parameters": [_parameter_described(s) for s in SPECS]})
+    listed = [_parameter_described(spec) for spec in px4_release(release).specs]
+    parameters = _compressed({"version": 1, "parameters": listed})
     events = _compressed(_event_document())
     entries = [
         {"type": kind, "uri": f"mftp://{_FOLDER}/{name}", "fileCrc": crc32part(data)}
@@ -57,13 +58,13 @@ def files() -> dict[str, bytes]:
     return {_GENERAL: general, _PARAMETERS: parameters, _EVENTS: events}
 
 
-def provide(storage: Storage) -> None:
-    """Write the files to a vehicle's storage if they are missing."""
+def provide(storage: Storage, release: PX4ReleaseName) -> None:
+    """Write the files of a PX4 release to a vehicle's storage if they are missing."""
     folder = storage.folder / _FOLDER
     if folder.is_dir():
         return
     folder.mkdir(parents=True)
-    for name, data in files().items():
+    for name, data in files(release).items():
         (folder / name).write_bytes(data)
 
 
@@ -71,7 +72,7 @@ def request_metadata(_command: VehicleCommand, context: Context) -> autopilot_st
     """Send COMPONENT_METADATA."""
     context.link.send(
         dialect.MAVLink_component_metadata_message(
-            boot_ms(context.now_us), crc32part(files()[_GENERAL]), _uri()
+            boot_ms(context.now_us), _checksum(context), _uri()
         )
     )
     return autopilot_state.Result.ACCEPTED
@@ -82,7 +83,7 @@ def request_information(_command: VehicleCommand, context: Context) -> autopilot
     no_crc, no_uri = 0, b""
     context.link.send(
         dialect.MAVLink_component_information_message(
-            boot_ms(context.now_us), crc32part(files()[_GENERAL]), _uri(), no_crc, no_uri
+            boot_ms(context.now_us), _checksum(context), _uri(), no_crc, no_uri
         )
     )
     return autopilot_state.Result.ACCEPTED
@@ -104,6 +105,10 @@ def _request_storage(command: VehicleCommand, context: Context) -> autopilot_sta
         )
     )
     return autopilot_state.Result.ACCEPTED
+
+
+def _checksum(context: Context) -> int:
+    return crc32part(files(context.port.parameters.release.name)[_GENERAL])
 
 
 def _uri() -> bytes:

@@ -126,7 +126,7 @@ def handle_request(message: codec.WireMessage, context: services.Context) -> boo
         # Checksums of large files take several ticks.
         if opcode == _CRC32:
             storage = context.vehicle_state(files.Storage)
-            component_metadata.provide(storage)
+            component_metadata.provide(storage, context.port.parameters.release.name)
             client.checksum = Checksum(request, storage.path(request.name))
             client.burst = None
             _continue_checksum(client.checksum, context)
@@ -198,10 +198,9 @@ def _execute(request: files.FtpRequest, context: services.Context) -> bytes:
     operation = files.OPERATIONS.get(request.opcode)
     if operation is None:
         raise files.RefusedError(files.Code.UNKNOWN_COMMAND)
-    component_metadata.provide(context.vehicle_state(files.Storage))
-    return operation(
-        request, context.state(FtpClient).session, context.vehicle_state(files.Storage)
-    )
+    storage = context.vehicle_state(files.Storage)
+    component_metadata.provide(storage, context.port.parameters.release.name)
+    return operation(request, context.state(FtpClient).session, storage)
 
 
 def _error(error: files.RefusedError | OSError) -> bytes:

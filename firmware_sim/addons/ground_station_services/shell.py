@@ -102,7 +102,10 @@ def run(words: Sequence[str], port: autopilot.BuiltinAutopilot, now_us: int) -> 
     return command(words[1:], port, now_us)
 
 
-_VERSION = "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
+def _version(_words: Sequence[str], port: autopilot.BuiltinAutopilot, _now_us: int) -> str:
+    """Run ver."""
+    release = port.parameters.release
+    return f"HW arch: AIRL_SITL\nPX4 version: {release.version} (emulated by airl-mav)\n"
 
 
 def _parameters(words: Sequence[str], port: autopilot.BuiltinAutopilot, _now_us: int) -> str:
@@ -206,7 +209,7 @@ COMMANDS: Mapping[str, Shown] = {
     "uptime": lambda _words, _port, now_us: (
         f"Uptime: {now_us / US_PER_S:.3f} s of simulated time\n"
     ),
-    "ver": lambda *_: _VERSION,
+    "ver": _version,
 }
 
 HANDLERS: Handlers = {"SERIAL_CONTROL": (for_anyone, handle_input)}

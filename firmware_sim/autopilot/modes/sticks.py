@@ -73,7 +73,7 @@ class YawStick:
     def turn(self, stick: float, yaw: float, dt: float) -> tuple[float, float]:
         """Return the heading [rad], NaN while turning, and the yaw rate [rad/s]."""
         value = self._value
-        shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_YAW_EXPO"))
+        shaped = expo(deadzone(stick, value("MAN_DEADZONE")), value("MPC_YAW_EXPO"))
         target = shaped * value("MPC_MAN_Y_MAX") * DEG
         # First-order filter of time constant MPC_MAN_Y_TAU: a jump of the stick must not become a
         # jump of the yaw rate.
@@ -101,7 +101,7 @@ class VerticalStick:
     def move(self, stick: float, down: float, height: float, dt: float) -> AxisDemand:
         """Return the demand, NED, from measured `down` and `height` above home [m]."""
         value, axis = self._value, self._axis
-        shaped = expo(deadzone(stick, value("MPC_HOLD_DZ")), value("MPC_Z_MAN_EXPO"))
+        shaped = expo(deadzone(stick, value("MAN_DEADZONE")), value("MPC_Z_MAN_EXPO"))
         target = self._speed(shaped, height)
         # Advance the previous plan first: the stick's new target is planned from there.
         axis.advance(dt)
@@ -203,7 +203,7 @@ class HorizontalStick:
     def _direction(self, sticks: tuple[float, float], yaw: float) -> tuple[float, float]:
         """Return the deflection north and east, with a norm of at most 1."""
         value = self._value
-        zone, share = value("MPC_HOLD_DZ"), value("MPC_XY_MAN_EXPO")
+        zone, share = value("MAN_DEADZONE"), value("MPC_XY_MAN_EXPO")
         forward, right = (expo(deadzone(s, zone), share) for s in sticks)
         # Diagonal stick travel must not exceed the speed of a single axis.
         length = max(1.0, math.hypot(forward, right))
@@ -378,7 +378,7 @@ class Piloted(interface.FlightMode):
     def _over_ground(self, sticks: interface.Sticks, state: Vector, z: AxisDemand) -> AxisDemand:
         """Return the vertical demand, which holds the height above ground if enabled."""
         value, hold, (vn, ve, vd) = self._context.value, self._terrain, triple(state, V)
-        zone = value("MPC_HOLD_DZ")
+        zone = value("MAN_DEADZONE")
         share = value("MPC_XY_MAN_EXPO")
         level = (expo(deadzone(s, zone), share) for s in (sticks.pitch, sticks.roll))
         ground = self._context.ground

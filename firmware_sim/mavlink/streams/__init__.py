@@ -48,7 +48,6 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "MISSION_CURRENT": status.mission_current,
         "HOME_POSITION": status.home_position,
         "GPS_GLOBAL_ORIGIN": status.gps_global_origin,
-        "AUTOPILOT_VERSION": status.autopilot_version,
         "ORBIT_EXECUTION_STATUS": status.orbit_execution_status,
         "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": status.autopilot_state_for_gimbal_device,
         "CURRENT_MODE": status.current_mode,
@@ -91,6 +90,9 @@ class Vehicle:
 VEHICLE_BUILDERS: Mapping[str, Callable[[Vehicle, AutopilotState], Values | None]] = (
     MappingProxyType(
         {
+            "AUTOPILOT_VERSION": lambda vehicle, _state: status.autopilot_version(
+                vehicle.port.parameters.release.flight_sw_version
+            ),
             "SYSTEM_TIME": lambda vehicle, state: status.system_time(state, vehicle.boot_unix_us),
             "VIBRATION": lambda vehicle, state: vehicle.vibration.message(state),
             "BATTERY_STATUS": lambda vehicle, state: sensors.battery_status(

@@ -37,9 +37,6 @@ CAPABILITIES: int = (
 )
 """Capabilities, with all add-ons equal to a real PX4's 0xE8FF."""
 
-_FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
-"""Emulated PX4 release: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
-
 _BOARD_VERSION = 1
 """Board version, as in PX4 SITL."""
 
@@ -238,13 +235,13 @@ def mission_current(state: AutopilotState) -> Values:
     return mission.current, total, _UNKNOWN_STATE, _UNKNOWN_STATE, *ids
 
 
-def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
-    """Return the identity and the actual capabilities of the built-in autopilot."""
+def autopilot_version(version: int) -> Values:
+    """Return identity, `flight_sw_version` and actual capabilities of the built-in autopilot."""
     os_version = vendor = product = 0
     middleware_custom_version = os_custom_version = (0,) * 8
     return (
         CAPABILITIES,
-        *(_FIRMWARE_VERSION, _FIRMWARE_VERSION, os_version, _BOARD_VERSION),
+        *(version, version, os_version, _BOARD_VERSION),
         *(*_CUSTOM_VERSION, *middleware_custom_version, *os_custom_version),
         *(vendor, product, _UID),
     )

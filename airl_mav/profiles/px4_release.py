@@ -1,0 +1,170 @@
+"""PX4 releases that the built-in flight controller emulates, from `profiles/px4`.
+
+Each folder is one release: `release.toml` has its version and its source, `parameters.csv` its
+parameters, both written by `scripts/px4_release.py` from PX4. The current release lists all
+parameters; another release lists only the rows that differ, and a name alone for a parameter that
+it lacks. `effects.csv` has this simulator's own columns: limits in flight and the effect.
+
+PX4 also stores values out of range, as does this flight controller. The control code uses the
+stored value clamped to safe bounds (`ParameterSpec.flown`).
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+from airl_mav.core.errors import UsageError
+from airl_mav.profiles.loading import profiles_dir, read_toml
+
+PX4ReleaseName = Literal["1.16", "1.17", "1.18"]
+
+CURRENT: PX4ReleaseName = "1.17"
+"""Current stable release. Flight code uses its parameter names."""
+
+OFF = "0|"
+"""Prefix of a lower flown bound: zero is also allowed and turns the function off."""
+
+_OFFICIAL = 255
+"""FIRMWARE_VERSION_TYPE_OFFICIAL."""
+
+
+class ParameterSpec(NamedTuple):
+    """One parameter: its type follows from the default (int = INT32, float = FLOAT)."""
+
+    name: str
+    default: int | float
+    low: float
+    """Range in PX4; -inf and inf = no limit."""
+    high: float
+    unit: str
+    flown_low: float
+    """Bounds of the value in flight. They may be wider or narrower than PX4's range."""
+    flown_high: float
+    zero_is_off: bool
+    """True if zero is used although it is below `flown_low`."""
+    meaning: str
+    """Effect in this simulator; empty = stored and returned without effect."""
+    current_name: str
+    """Name in the current release, by which flight code reads the value."""
+
+    def flown(self, value: float) -> float:
+        """Return the value used in flight for a stored `value`."""
+        if value == 0.0 and self.zero_is_off:
+            return 0.0
+        return min(self.flown_high, max(self.flown_low, float(value)))
+
+    @property
+    def is_used(self) -> bool:
+        """True if the parameter has an effect in this simulator."""
+        return bool(self.meaning)
+
+
+def _spec(row: Mapping[str, str], current_name: str) -> ParameterSpec:
+    number = int if row["type"] == "INT32" else float
+    low = float(row["min"] or -math.inf)
+    high = float(row["max"] or math.inf)
+    effect = _effects().get(current_name, {"flown_min": "", "flown_max": "", "meaning": ""})
+    flown_min = effect["flown_min"]
+    return ParameterSpec(
+        name=row["name"],
+        default=number(row["default"]),
+        low=low,
+        high=high,
+        unit=row["unit"],
+        flown_low=float(flown_min.removeprefix(OFF) or low),
+        flown_high=float(effect["flown_max"] or high),
+        zero_is_off=flown_min.startswith(OFF),
+        meaning=effect["meaning"],
+        current_name=current_name,
+    )
+
+
+@dataclass(frozen=True)
+class Px4Release:
+    """PX4 release: version, source and parameters."""
+
+    name: PX4ReleaseName
+    version: str
+    """Version that the flight controller reports, as 1.17.0."""
+    source: str
+    """Tag, commit and date of PX4's source that the data are from."""
+    specs: tuple[ParameterSpec, ...]
+    """Parameters in ascending order of the names."""
+
+    @property
+    def flight_sw_version(self) -> int:
+        """Version as in AUTOPILOT_VERSION: major, minor, patch, type of release, a byte each."""
+        return int.from_bytes((*map(int, self.version.split(".")), _OFFICIAL), "big")
+
+    @cached_property
+    def spec_by_name(self) -> Mapping[str, ParameterSpec]:
+        """Parameters by name."""
+        return {spec.name: spec for spec in self.specs}
+
+    @cached_property
+    def _flown_defaults(self) -> Mapping[str, float]:
+        # A parameter that this release lacks is flown with another release's default.
+        others = [px4_release(name) for name in get_args(PX4ReleaseName) if name != self.name]
+        return {
+            spec.current_name: spec.flown(spec.default)
+            for release in (*others, self)
+            for spec in release.specs
+        }
+
+    def parameter_values(self, overrides: Mapping[str, int | float]) -> dict[str, int | float]:
+        """Return all parameters, with a vehicle profile's overrides. Raises UsageError."""
+        values = {spec.name: spec.default for spec in self.specs}
+        for name, value in overrides.items():
+            spec = self.spec_by_name.get(name)
+            if spec is None:
+                raise UsageError(f"parameters.{name}: no such parameter in PX4 {self.name}")
+            if not (math.isfinite(value) and spec.low <= value <= spec.high):
+                raise UsageError(
+                    f"parameters.{name} = {value}: accepted: "
+                    f"{spec.low:g} <= value <= {spec.high:g} {spec.unit}".rstrip()
+                )
+            if isinstance(spec.default, int) and value != int(value):
+                raise UsageError(f"parameters.{name} = {value}: accepted: a whole number")
+            values[name] = type(spec.default)(value)
+        return values
+
+    def flown_values(self, overrides: Mapping[str, int | float]) -> dict[str, float]:
+        """Return the values in flight by the names of the current release.
+
+        Raises:
+            UsageError: As `parameter_values`.
+        """
+        stored = self.parameter_values(overrides)
+        specs = [self.spec_by_name[name] for name in overrides]
+        flown = {spec.current_name: spec.flown(stored[spec.name]) for spec in specs}
+        return {**self._flown_defaults, **flown}
+
+
+@cache
+def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
+    """Return a release by name."""
+    facts = read_toml(_folder(name) / "release.toml")
+    current_names = {own: current for current, own in facts["renamed"].items()}
+    rows = _rows(_folder(CURRENT) / "parameters.csv") | _rows(_folder(name) / "parameters.csv")
+    specs = (_spec(r, current_names.get(n, n)) for n, r in sorted(rows.items()) if r["type"])
+    return Px4Release(name, facts["version"], facts["source"], tuple(specs))
+
+
+def _folder(name: str) -> Path:
+    return profiles_dir() / "px4" / name
+
+
+@cache
+def _effects() -> Mapping[str, Mapping[str, str]]:
+    return _rows(profiles_dir() / "px4" / "effects.csv")
+
+
+def _rows(path: Path) -> dict[str, dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
