@@ -17,7 +17,9 @@ from airl_mav.control import loops
 from airl_mav.control.demand import AttitudeDemand, Demand, Gains, RateDemand, TrajectoryDemand
 from airl_mav.control.memory import (
     ATTITUDE_SP,
+    CORRECTION,
     DGYRO,
+    FOLLOWS,
     GYRO,
     GYRO_NEWER,
     GYRO_OLDER,
@@ -160,9 +162,8 @@ def attitude_tick(
     """
     first = start(velocity, omega, memory, weights)
     _skip_position_loop(velocity, memory, weights, dt)
-    for i in range(4):
-        memory[ATTITUDE_SP + i] = demand.attitude[i]
     memory[YAW_RATE_SP], memory[THRUST_SP] = demand.yaw_rate, demand.thrust
+    _follow(demand.attitude, memory, gains, dt)
     return _inner_loops(q, omega, attitude_sp(memory), first, memory, gains, weights, dt)
 
 
@@ -189,7 +190,7 @@ def rate_tick(
         memory[RATES_SP + i] = demand.rates[i]
     # The rate demand bypasses the attitude loop: the present attitude is the setpoint.
     memory[YAW_RATE_SP], memory[THRUST_SP] = 0.0, demand.thrust
-    memory[THRUST_ON] = demand.thrust
+    memory[THRUST_ON], memory[FOLLOWS] = demand.thrust, 0.0
     motors = _rate_loop(omega, demand.rates, demand.thrust, memory, gains, weights, dt)
     return Output(motors, demand.thrust, q, demand.rates, three(memory, VELOCITY_SP))
 
@@ -253,7 +254,7 @@ def _skip_position_loop(velocity: Vec, memory: Memory, weights: Filters, dt: flo
 def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
     """Start: the filters are settled at the first sample, the position loop is due."""
     memory[PRIMED] = 1.0
-    memory[WAIT] = 0.0
+    memory[WAIT], memory[FOLLOWS] = 0.0, 0.0
     for i in range(3):
         memory[VEL_LP + i] = velocity[i]
         memory[GYRO + i] = omega[i]
@@ -291,7 +292,7 @@ def position_loop(
         gains,
         period,
     )
-    _publish(velocity_sp, thrust, integral, demand.yaw, demand.yaw_rate, q, memory)
+    _publish(velocity_sp, thrust, integral, demand.yaw, demand.yaw_rate, q, memory, gains, period)
 
 
 @kernel
@@ -322,7 +323,7 @@ def _trajectory_loop(
         gains,
         period,
     )
-    _publish(velocity_sp, thrust, integral, demand.yaw, demand.yaw_rate, q, memory)
+    _publish(velocity_sp, thrust, integral, demand.yaw, demand.yaw_rate, q, memory, gains, period)
 
 
 @kernel
@@ -344,6 +345,8 @@ def _publish(
     yaw_rate: float,
     q: Quat,
     memory: Memory,
+    gains: Gains,
+    period: float,
 ) -> None:
     """Store the position loop's output: attitude, yaw rate and collective."""
     if math.isnan(yaw):
@@ -355,11 +358,27 @@ def _publish(
     for i in range(3):
         memory[VEL_INT + i] = integral[i]
         memory[VELOCITY_SP + i] = velocity_sp[i]
-    for i in range(4):
-        memory[ATTITUDE_SP + i] = q_sp[i]
     memory[YAW_RATE_SP] = 0.0 if math.isnan(yaw_rate) else yaw_rate
+    _follow(q_sp, memory, gains, period)
     # The collective is the length of the thrust vector, which is already normalised.
     memory[THRUST_SP] = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
+
+
+@kernel
+def _follow(q_sp: Quat, memory: Memory, gains: Gains, period: float) -> None:
+    """Store an attitude setpoint, through the reference model if the release has one."""
+    q_ref, correction = q_sp, (0.0, 0.0, 0.0)
+    if gains.ref_w_n > 0.0 and memory[FOLLOWS] != 0.0:
+        a = ATTITUDE_SP
+        before = (memory[a], memory[a + 1], memory[a + 2], memory[a + 3])
+        q_ref, correction = loops.reference_model(
+            before, three(memory, CORRECTION), q_sp, memory[YAW_RATE_SP], gains.ref_w_n, period
+        )
+    memory[FOLLOWS] = 1.0
+    for i in range(4):
+        memory[ATTITUDE_SP + i] = q_ref[i]
+    for i in range(3):
+        memory[CORRECTION + i] = correction[i]
 
 
 @kernel

@@ -95,6 +95,7 @@ class Gains(NamedTuple):
     att_p_pitch: Annotated[float, "MC_PITCH_P"]
     att_p_yaw: Annotated[float, "MC_YAW_P"]
     yaw_weight: Annotated[float, "MC_YAW_WEIGHT"]
+    ref_w_n: Annotated[float, "MC_REF_W_N"]
     rate_max_roll: Annotated[float, "MC_ROLLRATE_MAX", DEG]
     rate_max_pitch: Annotated[float, "MC_PITCHRATE_MAX", DEG]
     rate_max_yaw: Annotated[float, "MC_YAWRATE_MAX", DEG]

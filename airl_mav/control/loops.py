@@ -259,6 +259,40 @@ def _shortest(a: Vec, b: Vec) -> Quat:
 
 
 @kernel
+def reference_model(
+    q_ref: Quat, correction: Vec, q_sp: Quat, yaw_rate: float, w_n: float, dt: float
+) -> tuple[Quat, Vec]:
+    """Return the next reference attitude and its correction rate FRD [rad/s].
+
+    A critically damped second-order model with natural frequency `w_n` [rad/s] follows the
+    attitude setpoint; dt [s] is the time since the last one. Source: PX4 1.18,
+    AttitudeControl::propagateReferenceModel.
+    """
+    back = conjugate(q_ref)
+    down = rotate(back, (0.0, 0.0, 1.0))
+    error = multiply(back, q_sp)
+    double = 2.0 if error[0] >= 0.0 else -2.0
+    ex, ey, ez = double * error[1], double * error[2], double * error[3]
+    decay = math.exp(-w_n * dt)
+    by_error, by_rate = 1.0 - (1.0 + w_n * dt) * decay, dt * decay
+    cx, cy, cz = correction
+    turn = yaw_rate * dt
+    half_x = 0.5 * (by_error * ex + by_rate * cx + turn * down[0])
+    half_y = 0.5 * (by_error * ey + by_rate * cy + turn * down[1])
+    half_z = 0.5 * (by_error * ez + by_rate * cz + turn * down[2])
+    angle = math.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
+    s = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    stiff, damped = w_n * w_n * dt * decay, (1.0 - w_n * dt) * decay
+    cx, cy, cz = stiff * ex + damped * cx, stiff * ey + damped * cy, stiff * ez + damped * cz
+    # A commanded yaw rate is followed without a correction about the vertical.
+    if yaw_rate != 0.0:
+        vertical = cx * down[0] + cy * down[1] + cz * down[2]
+        cx, cy, cz = cx - vertical * down[0], cy - vertical * down[1], cz - vertical * down[2]
+    turned = multiply(q_ref, (math.cos(angle), s * half_x, s * half_y, s * half_z))
+    return normalize(turned), (cx, cy, cz)
+
+
+@kernel
 def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
     """Return the body rates FRD [rad/s] from attitude q to q_sp, heading rate fed forward."""
     reduced, half_turn = reduced_attitude(q, q_sp)

@@ -81,7 +81,9 @@ YAW_TORQUE, PRIMED, WAIT = 27, 28, 29
 VELOCITY_SP, ATTITUDE_SP, YAW_RATE_SP, THRUST_SP = 30, 33, 37, 38
 # Output of the attitude loop: rates and, passed on, collective.
 RATES_SP, THRUST_ON = 39, 42
-MEMORY_SIZE = 43
+# Reference model of the attitude: correction rate, and 1 while it follows setpoints.
+CORRECTION, FOLLOWS = 43, 46
+MEMORY_SIZE = 47
 
 
 def ticks_to_motors(memory: Memory) -> int:

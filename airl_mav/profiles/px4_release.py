@@ -52,6 +52,8 @@ class ParameterSpec(NamedTuple):
     """Effect in this simulator; empty = stored and returned without effect."""
     current_name: str
     """Name in the current release, by which flight code reads the value."""
+    absent: float
+    """Value in flight of a release that lacks the parameter."""
 
     def flown(self, value: float) -> float:
         """Return the value used in flight for a stored `value`."""
@@ -65,15 +67,19 @@ class ParameterSpec(NamedTuple):
         return bool(self.meaning)
 
 
+_NO_EFFECT = {"flown_min": "", "flown_max": "", "meaning": "", "absent": ""}
+
+
 def _spec(row: Mapping[str, str], current_name: str) -> ParameterSpec:
     number = int if row["type"] == "INT32" else float
     low = float(row["min"] or -math.inf)
     high = float(row["max"] or math.inf)
-    effect = _effects().get(current_name, {"flown_min": "", "flown_max": "", "meaning": ""})
+    effect = _effects().get(current_name, _NO_EFFECT)
     flown_min = effect["flown_min"]
-    return ParameterSpec(
+    default = number(row["default"])
+    spec = ParameterSpec(
         name=row["name"],
-        default=number(row["default"]),
+        default=default,
         low=low,
         high=high,
         unit=row["unit"],
@@ -82,7 +88,10 @@ def _spec(row: Mapping[str, str], current_name: str) -> ParameterSpec:
         zero_is_off=flown_min.startswith(OFF),
         meaning=effect["meaning"],
         current_name=current_name,
+        absent=float(effect["absent"] or math.nan),
     )
+    # Without a value of its own, a missing parameter is flown with another release's default.
+    return spec if effect["absent"] else spec._replace(absent=spec.flown(default))
 
 
 @dataclass(frozen=True)
@@ -109,13 +118,9 @@ class Px4Release:
 
     @cached_property
     def _flown_defaults(self) -> Mapping[str, float]:
-        # A parameter that this release lacks is flown with another release's default.
         others = [px4_release(name) for name in get_args(PX4ReleaseName) if name != self.name]
-        return {
-            spec.current_name: spec.flown(spec.default)
-            for release in (*others, self)
-            for spec in release.specs
-        }
+        absent = {spec.current_name: spec.absent for other in others for spec in other.specs}
+        return absent | {spec.current_name: spec.flown(spec.default) for spec in self.specs}
 
     def parameter_values(self, overrides: Mapping[str, int | float]) -> dict[str, int | float]:
         """Return all parameters, with a vehicle profile's overrides. Raises UsageError."""
