@@ -23,8 +23,11 @@ from typing import Any, get_args
 from pyulog import ULog
 
 from airl_mav.core.errors import UsageError
+from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.mavlink import services
+from firmware_sim.mavlink.codec import dialect
 
 PX4 = Path(__file__).resolve().parent.parent / "profiles" / "px4"
 BUILD = "build/px4_sitl_default"
@@ -38,7 +41,7 @@ RENAMED = {
 }
 """Names in a release of parameters that this simulator uses, by their name in the current one."""
 
-LATER = {"MIS_DIST_1WP": 10000.0, "MIS_TKO_LAND_REQ": 0, "GPS_UBX_DYNMODEL": 6}
+ALSO = {"MIS_DIST_1WP": 10000.0, "MIS_TKO_LAND_REQ": 0, "GPS_UBX_DYNMODEL": 6}
 """Parameters that PX4 lists after a mission's check, or with the GPS driver; their values."""
 
 UNITS = {"norm": "", "SD": "", "normalized_thrust": "", "normalized_thrust/s": "1/s", "g0": "g"} | {
@@ -55,9 +58,13 @@ def parameters(tree: Path, log: Path) -> dict[str, tuple[str, ...]]:
     """Return the columns of each parameter that a release serves, by name."""
     listed = json.loads((tree / BUILD / "parameters.json").read_text())["parameters"]
     described = {each["name"]: each for each in listed}
-    flown = LATER | ULog(str(log), []).initial_parameters
+    flown = ALSO | ULog(str(log), []).initial_parameters
     # The vehicle has its own rotor positions.
-    flown |= {n: v for n, v in load_vehicle("quad").rotor.px4_geometry().items() if "_P" in n}
+    flown |= {
+        n: v
+        for n, v in load_profile("vehicles", "quad", VehicleProfile).rotor.px4_geometry().items()
+        if "_P" in n
+    }
     names = sorted(flown.keys() & described.keys())
     return {name: _columns(described[name], flown[name]) for name in names}
 
@@ -95,6 +102,51 @@ def differences(
     ]
 
 
+def unknown_commands(tree: Path) -> dict[str, int]:
+    """Return the commands that this simulator supports and a release does not, by name."""
+    message = next((tree / "msg").rglob("VehicleCommand.msg")).read_text()
+    numbers = {n: int(v) for n, v in re.findall(r"VEHICLE_CMD_(\w+)\s*=\s*(\d+)", message)}
+    names = {number: each.name for number, each in dialect.enums["MAV_CMD"].items()}
+    numbers |= {name.removeprefix("MAV_CMD_"): number for number, name in names.items()}
+    code = (path.read_text(errors="replace") for path in (tree / "src/modules").rglob("*.[ch]pp"))
+    found = {name for text in code for name in re.findall(r"(?:MAV|VEHICLE)_CMD_(\w+)", text)}
+    known = {numbers.get(name) for name in found}
+    listed = sorted(services.table("ACTIONS").keys() - known)
+    return {names[number].removeprefix("MAV_CMD_"): number for number in listed}
+
+
+def _table(name: str, comment: str, values: Mapping[str, object]) -> str:
+    rows = "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+    return f"\n# {comment}\n[{name}]\n{rows}"
+
+
+FAILSAFES = {
+    "fallback_needs_pilot": "manualControlFallbackAction",
+    "exceptions_cover_auto_modes": "LinkLossExceptionBits::AutoModes",
+    "gcs_loss_needs_arming": r"dll_loss_ignored_land \|\| !state.armed",
+    "takeover_needs_action": r"user_intended_mode_updated && \(_selected_action > Action::Warn\)",
+    "orbit_ends_at_once": "Failsafe engaged, downgrading ORBIT",
+}
+"""Text in PX4's failsafe.cpp or framework.cpp that shows a rule of `FailsafeRules`."""
+
+LATER = {"1.17": {"fallback_needs_pilot": True}}
+"""Rules of a release that came after the source: PX4 26391, in 1.17.0."""
+
+
+def failsafes(tree: Path, release: str) -> dict[str, bool | int]:
+    """Return the rules of a release's failsafes."""
+    folder = tree / "src/modules/commander/failsafe"
+    code = "".join((folder / name).read_text() for name in ("failsafe.cpp", "framework.cpp"))
+    found: dict[str, bool | int] = {
+        rule: re.search(text, code) is not None for rule, text in FAILSAFES.items()
+    }
+    undelayed = re.search(r"bool action_can_be_delayed[^;]*", code)
+    names = undelayed.group() if undelayed else ""
+    found["delays_from"] = sum(f"Action::{name} " in names for name in ("None", "Warn"))
+    found["warning_has_text"] = "if (action != Action::Warn) {" not in code
+    return found | LATER.get(release, {})
+
+
 def source(tree: Path) -> str:
     """Return tag, commit and date of a source tree."""
 
@@ -125,11 +177,14 @@ def write(release: PX4ReleaseName, tree: Path, log: Path) -> None:
         listed = differences(rows, read(PX4 / CURRENT / "parameters.csv"))
     with (folder / "parameters.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([COLUMNS, *listed])
-    renamed = "".join(f'{new} = "{old}"\n' for new, old in RENAMED.get(release, {}).items())
+    renamed, unknown = RENAMED.get(release, {}), unknown_commands(tree)
     (folder / "release.toml").write_text(
-        f'version = "{release}.0"\nsource = "{source(tree)}"\n\n'
-        "# Names in this release, by the name in the current one.\n"
-        f"[renamed]\n{renamed}",
+        f'version = "{release}.0"\nsource = "{source(tree)}"\n'
+        + _table("renamed", "Names in this release, by the name in the current one.", renamed)
+        + _table(
+            "failsafes", "Rules of the failsafes, see FailsafeRules.", failsafes(tree, release)
+        )
+        + _table("unknown_commands", "Commands that this release does not support.", unknown),
         encoding="utf-8",
     )
     print(f"{folder}: {len(rows)} parameters")

@@ -94,6 +94,25 @@ def _spec(row: Mapping[str, str], current_name: str) -> ParameterSpec:
     return spec if effect["absent"] else spec._replace(absent=spec.flown(default))
 
 
+class FailsafeRules(NamedTuple):
+    """Differences of the failsafes between releases."""
+
+    fallback_needs_pilot: bool
+    """True if NAV_RCL_ACT replaces a fallback to a piloted mode without manual control."""
+    exceptions_cover_auto_modes: bool
+    """True if bit 1 of COM_RCL_EXCEPT and COM_DLL_EXCEPT covers all automatic modes."""
+    gcs_loss_needs_arming: bool
+    """True if the loss of the ground station counts in an armed vehicle only."""
+    takeover_needs_action: bool
+    """True if a mode selection takes over from any action, False from an unchanged one."""
+    delays_from: int
+    """Lowest action that waits in Hold: 0 none, 1 warning, 2 fallback."""
+    orbit_ends_at_once: bool
+    """True if the beginning of a failsafe turns Orbit into Hold, False its end."""
+    warning_has_text: bool
+    """True if a warning has a text, False an event alone."""
+
+
 @dataclass(frozen=True)
 class Px4Release:
     """PX4 release: version, source and parameters."""
@@ -103,6 +122,9 @@ class Px4Release:
     """Version that the flight controller reports, as 1.17.0."""
     source: str
     """Tag, commit and date of PX4's source that the data are from."""
+    unknown_commands: frozenset[int]
+    """Commands (MAV_CMD) of other releases that this release does not support."""
+    failsafes: FailsafeRules
     specs: tuple[ParameterSpec, ...]
     """Parameters in ascending order of the names."""
 
@@ -158,7 +180,9 @@ def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
     current_names = {own: current for current, own in facts["renamed"].items()}
     rows = _rows(_folder(CURRENT) / "parameters.csv") | _rows(_folder(name) / "parameters.csv")
     specs = (_spec(r, current_names.get(n, n)) for n, r in sorted(rows.items()) if r["type"])
-    return Px4Release(name, facts["version"], facts["source"], tuple(specs))
+    unknown = frozenset(facts["unknown_commands"].values())
+    rules = FailsafeRules(**facts["failsafes"])
+    return Px4Release(name, facts["version"], facts["source"], unknown, rules, tuple(specs))
 
 
 def _folder(name: str) -> Path:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.px4_release import PX4ReleaseName
+from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot_state import Result, Severity, Wire
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.failsafes.framework import LOOK_US
@@ -92,8 +94,18 @@ def horizontal(rig: Rig) -> float:
 # --- offboard loss
 
 
+def test_loss_without_a_pilot_returns() -> None:
+    """PX4 1.17: nobody flies the Position mode of COM_OBL_RC_ACT 0, so NAV_RCL_ACT acts."""
+    with flight(SEED, parameters={"COM_OBL_RC_ACT": 0, "RTL_RETURN_ALT": 5.0}) as rig:
+        assert LOSS_S[0] <= lose_offboard(rig) <= LOSS_S[1]
+        assert rig.mode is Mode.RETURN
+        until_disarmed(rig, 60.0)
+        assert horizontal(rig) < 1.0
+
+
 def test_loss_position_levels_descends_and_lands() -> None:
-    with flight(SEED, parameters={"COM_OBL_RC_ACT": 0}) as rig:
+    old = load_vehicle("quad", "1.16")
+    with flight(SEED, vehicle=old, parameters={"COM_OBL_RC_ACT": 0}) as rig:
         assert LOSS_S[0] <= lose_offboard(rig) <= LOSS_S[1]
         assert rig.mode is Mode.POSITION
         status = rig.ap.state().status
@@ -191,7 +203,7 @@ def test_same_seed_same_tick() -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "mode"), [(0, Mode.POSITION), (3, Mode.RETURN), (4, Mode.LAND), (5, Mode.HOLD)]
+    ("action", "mode"), [(0, Mode.RETURN), (3, Mode.RETURN), (4, Mode.LAND), (5, Mode.HOLD)]
 )
 def test_setpoints_that_come_back_take_over(action: int, mode: Mode) -> None:
     with flight(SEED, parameters={"COM_OBL_RC_ACT": action, "RTL_RETURN_ALT": 5.0}) as rig:
@@ -235,7 +247,7 @@ def test_slow_setpoints(rate_hz: float, alive: bool) -> None:
             assert count(rig, "Failsafe") == 0
         else:
             changes = [(a, b) for a, b in pairwise(modes) if a is not b]
-            lost, back = (Mode.OFFBOARD, Mode.POSITION), (Mode.POSITION, Mode.OFFBOARD)
+            lost, back = (Mode.OFFBOARD, Mode.RETURN), (Mode.RETURN, Mode.OFFBOARD)
             assert changes == [lost, *[back, lost] * (n - 1)]
             assert count(rig, "Failsafe activated") == n
 
@@ -352,8 +364,15 @@ class Drain:
         return self._step(sample._replace(battery=battery))
 
 
-def test_battery_levels_are_said_once_each() -> None:
-    with flight(SEED, parameters={"COM_LOW_BAT_ACT": 0}) as rig:
+@pytest.mark.parametrize(
+    ("release", "warned"), [("1.16", [(Severity.CRITICAL, "Failsafe activated")]), ("1.17", [])]
+)
+def test_battery_levels_are_said_once_each(
+    release: PX4ReleaseName, warned: list[tuple[Severity, str]]
+) -> None:
+    """From PX4 1.17 on, a warning of the failsafes is an event alone."""
+    vehicle = load_vehicle("quad", release)
+    with flight(SEED, vehicle=vehicle, parameters={"COM_LOW_BAT_ACT": 0}) as rig:
         drain = Drain(rig)
         rig.take_off(2.5, settle_s=0.0)
         rig.ap.take_messages()
@@ -364,16 +383,12 @@ def test_battery_levels_are_said_once_each() -> None:
 
         drain.remaining, drain.per_s = 0.16, 0.008
         rig.run(16.0, note)
-        warned = (Severity.CRITICAL, "Failsafe activated")
         assert [(severity, text) for severity, text, _ in said] == [
-            (Severity.EMERGENCY, LOW),
-            warned,
-            (Severity.EMERGENCY, CRITICAL),
-            warned,
-            (Severity.EMERGENCY, EMERGENCY),
-            warned,
+            *[(Severity.EMERGENCY, LOW), *warned],
+            *[(Severity.EMERGENCY, CRITICAL), *warned],
+            *[(Severity.EMERGENCY, EMERGENCY), *warned],
         ]
-        levels = [0.15, 0.15, 0.07, 0.07, 0.05, 0.05]
+        levels = [level for level in (0.15, 0.07, 0.05) for _ in range(1 + len(warned))]
         assert [at for _, _, at in said] == pytest.approx(levels, abs=1e-3)
         assert rig.mode is Mode.HOLD  # 0 = only warn
         assert not rig.ap.flight.failsafe

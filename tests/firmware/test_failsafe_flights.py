@@ -212,7 +212,8 @@ def test_a_flip_terminates_where_that_is_switched_on(breaker: int, ends: Mode) -
             return controls._replace(motors=(0.0, *controls.motors[1:]))
 
         rig.step_through(crippled)
-        rig.until(lambda: said(rig, "Failsafe activated") > 0, 5.0)
+        rig.until(lambda: said(rig, "Preflight Fail: Attitude failure") > 0, 5.0)
+        rig.run(0.2)
         assert rig.mode is ends
         assert said(rig, "Preflight Fail: Attitude failure") == 1
 

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from airl_mav.profiles.px4_release import PX4ReleaseName, px4_release
 from firmware_sim.autopilot.events.definition import FailsafeAction
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     BatteryWarning,
@@ -60,6 +61,7 @@ class Machine:
         self.options = options or FailsafeSettings()
         self.conditions = FINE
         self.mission_finished = False
+        self.rules = px4_release().failsafes
         self.texts: list[str] = []
         self.last = self.step(0)
 
@@ -76,6 +78,7 @@ class Machine:
             self.mode,
             self.mission_finished,
             armed=self.armed,
+            rules=self.rules,
         )
         self.last = update(self.state, now, asked)
         self.state, self.mode = self.last.state, self.last.intended
@@ -178,16 +181,22 @@ def test_already_returning_or_landing_it_only_warns() -> None:
         assert (m.action(), m.last.mode) == (FailsafeAction.WARN, mode)
 
 
-def test_a_condition_that_flaps_acts_in_the_end() -> None:
+@pytest.mark.parametrize(
+    ("release", "between"), [("1.16", FailsafeAction.HOLD), ("1.17", FailsafeAction.NONE)]
+)
+def test_a_condition_that_flaps_acts_in_the_end(
+    release: PX4ReleaseName, between: FailsafeAction
+) -> None:
     """A wait that has begun runs on without its cause; the next is shorter than the first."""
     m = flying(Mode.MISSION)
+    m.rules = px4_release(release).failsafes
     for _ in range(3):
         m.step(flight_time_limit_exceeded=True)
         m.step(1 * S)
         assert m.action() is FailsafeAction.HOLD
         m.step(flight_time_limit_exceeded=False)
         m.step(500 * MS)
-        assert m.action() is FailsafeAction.HOLD
+        assert m.action() is between
     m.step(1 * S)
     assert m.action() is FailsafeAction.NONE
     m.step(flight_time_limit_exceeded=True)
@@ -377,10 +386,10 @@ def _pick(
     return otherwise if found is None else found
 
 
-def _excepted(k: Known) -> bool:
-    """COM_RCL_EXCEPT, bit 0 Mission, 1 Hold (and Takeoff), 2 Offboard."""
+def _excepted(k: Known, exceptions: int) -> bool:
+    """COM_RCL_EXCEPT and COM_DLL_EXCEPT, bit 0 Mission, 1 Hold (and Takeoff), 2 Offboard."""
     bit = {Mode.MISSION: 1, Mode.HOLD: 2, Mode.TAKEOFF: 2, Mode.OFFBOARD: 4}.get(k.mode, 0)
-    return bool(k.p.com_rcl_except & bit)
+    return bool(exceptions & bit)
 
 
 def _low_battery(k: Known) -> FailsafeAction:
@@ -410,20 +419,16 @@ def _unflyable(k: Known) -> FailsafeAction:
         if k.p.com_obl_rc_act == 7:
             return FailsafeAction.DISARM
         action, mode = losses[k.p.com_obl_rc_act]
-    steps = {
-        0: [
-            (Mode.POSITION, FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
-            (Mode.ALTITUDE, FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
-        ],
-        1: [
-            (Mode.POSITION, FailsafeAction.LAND, Mode.LAND),
-            (Mode.LAND, FailsafeAction.DESCEND, Mode.DESCEND),
-        ],
-    }[k.p.com_posctl_navl]
-    if mode is Mode.POSITION or k.p.com_posctl_navl == 0:
-        for at, then, into in steps:
-            if mode is at and not _flies(at, k.c):
-                action, mode = then, into
+    for at, then, into in (
+        (Mode.POSITION, FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE),
+        (Mode.ALTITUDE, FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED),
+    ):
+        if mode is at and not _flies(at, k.c):
+            action, mode = then, into
+    piloted = (Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED)
+    if action is not FailsafeAction.NONE and mode in piloted and k.c.manual_control_signal_lost:
+        # Nobody flies the fallback: as if the pilot were lost.
+        action = _pick(_LINK, k.p.nav_rcl_act, FailsafeAction.NONE)
     return action if _flies(mode, k.c) else FailsafeAction.RTL
 
 
@@ -456,12 +461,16 @@ def _flies(mode: Mode, c: Conditions) -> bool:
 RULES: list[Callable[[Known], FailsafeAction]] = [
     lambda k: (
         _pick(_LINK, k.p.nav_rcl_act, FailsafeAction.NONE)
-        if k.c.manual_control_signal_lost and k.p.com_rc_in_mode != 4 and not _excepted(k)
+        if k.c.manual_control_signal_lost
+        and k.p.com_rc_in_mode != 4
+        and not _excepted(k, k.p.com_rcl_except)
         else FailsafeAction.NONE
     ),
     lambda k: (
         _pick(_LINK, k.p.nav_dll_act, FailsafeAction.NONE)
-        if k.c.gcs_connection_lost and k.mode not in (Mode.LAND, Mode.PRECISION_LAND)
+        if k.c.gcs_connection_lost
+        and k.mode not in (Mode.LAND, Mode.PRECISION_LAND)
+        and not _excepted(k, k.p.com_dll_except)
         else FailsafeAction.NONE
     ),
     lambda k: FailsafeAction.RTL if k.c.flight_time_limit_exceeded else FailsafeAction.NONE,
@@ -544,7 +553,7 @@ OPTIONS = st.builds(
     com_low_bat_act=st.integers(0, 3),
     com_obl_rc_act=st.integers(0, 7),
     com_pos_low_act=st.integers(0, 5),
-    com_posctl_navl=st.integers(0, 1),
+    com_dll_except=st.integers(0, 7),
     com_rc_in_mode=st.integers(0, 4),
     com_rcl_except=st.integers(0, 7),
     cbrk_flightterm=st.sampled_from([0, 121212]),
@@ -604,10 +613,15 @@ def test_disarmed_nothing_acts_and_nothing_is_said(
     assert machine.texts == []
 
 
-@given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
-def test_answers_are_none_for_a_vehicle_that_lacks_nothing(
-    conditions: Conditions, options: FailsafeSettings, mode: Mode
+@given(OPTIONS, st.sampled_from(Mode))
+def test_nothing_fails_on_a_vehicle_that_lacks_nothing(
+    options: FailsafeSettings, mode: Mode
 ) -> None:
-    assert answers(Situation(0, FINE, options, mode)) == []
-    found = answers(Situation(0, conditions, options, mode))
-    assert len({trigger for trigger, _ in found}) == len(found), "one answer a trigger"
+    assert not any(answers(Situation(0, FINE, options, mode)).values())
+
+
+def test_one_row_of_a_trigger_is_checked_at_a_time() -> None:
+    for armed_us, breaker in product((None, 1), (0, 121212)):
+        now = Situation(2, FINE, FailsafeSettings(cbrk_flightterm=breaker), Mode.HOLD)
+        checked = [row.trigger for row in TABLE if row.checked(now._replace(armed_us=armed_us))]
+        assert len(set(checked)) == len(checked)

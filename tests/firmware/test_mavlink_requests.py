@@ -121,7 +121,7 @@ def test_identity(rig: Rig) -> None:
         (version,) = [m for m in messages if m.get_type() == "AUTOPILOT_VERSION"]
     assert version.capabilities == CAPABILITIES
     assert CAPABILITIES & ~0xE8FF == 0, "a real PX4 has no such bit"
-    assert version.flight_sw_version == 0x0110_00FF
+    assert version.flight_sw_version == 0x0111_00FF
     assert version.uid != 0
     assert version.board_version == 1
 

@@ -39,7 +39,7 @@ def test_mavsdks_shell_has_an_answer() -> None:
         shell.subscribe_receive(lambda text, _data: heard.append(str(text.data)))
         shell.send("ver all", Device.SHELL)
         deadline = time.monotonic() + PATIENCE_S
-        while "PX4 version: 1.16" not in "".join(heard):
+        while "PX4 version: 1.17" not in "".join(heard):
             assert time.monotonic() < deadline, heard
             time.sleep(0.01)
 

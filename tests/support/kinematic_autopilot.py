@@ -117,6 +117,8 @@ class KnownState(NamedTuple):
 class Parameters:
     """A parameter store: names sorted, values as given."""
 
+    release = px4_release()
+
     def __init__(self, values: dict[str, int | float] | None = None) -> None:
         self.values = dict(sorted((DEFAULT_PARAMETERS if values is None else values).items()))
         self.history: list[tuple[str, float, float]] = []

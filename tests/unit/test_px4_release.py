@@ -15,6 +15,8 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.autopilot.parameter_store import Parameters
+from tests.support.kinematic_autopilot import KinematicAutopilot
+from tests.support.mavlink_clients import Rig
 
 RELEASES: tuple[PX4ReleaseName, ...] = get_args(PX4ReleaseName)
 
@@ -102,3 +104,17 @@ def test_a_release_of_real_firmware_is_rejected() -> None:
 def test_a_parameter_that_the_release_lacks_is_one_line() -> None:
     with pytest.raises(UsageError, match=r"MPC_XY_MAN_EXPO: no such parameter in PX4 1\.17"):
         px4_release("1.17").parameter_values({"MPC_XY_MAN_EXPO": 0.5})
+
+
+@pytest.mark.parametrize(("release", "result"), [("1.17", 0), ("1.18", 3)])
+def test_commands_that_a_release_lacks_are_unsupported(
+    release: PX4ReleaseName, result: int
+) -> None:
+    autopilot = KinematicAutopilot()
+    autopilot.parameters.release = px4_release(release)
+    rig = Rig(autopilot)
+    for number in (519, 520, 528):  # PROTOCOL_VERSION, AUTOPILOT_CAPABILITIES, FLIGHT_INFORMATION
+        assert rig.command(number, 1)[0] == result
+    _, messages = rig.command(512, 148)
+    (version,) = [m for m in messages if m.get_type() == "AUTOPILOT_VERSION"]
+    assert version.flight_sw_version == px4_release(release).flight_sw_version

@@ -24,13 +24,13 @@ class FailsafeSettings(NamedTuple):
     """
 
     com_act_fail_act: int = 0
+    com_dll_except: int = 0
     com_fail_act_t: float = 5.0
-    com_fltt_low_act: int = 3
+    com_fltt_low_act: int = 0
     com_lkdown_tko: float = 3.0
     com_low_bat_act: int = 0
     com_obl_rc_act: int = 0
     com_pos_low_act: int = 3
-    com_posctl_navl: int = 0
     com_rc_in_mode: int = 3
     com_rcl_except: int = 0
     com_spoolup_time: float = 1.0

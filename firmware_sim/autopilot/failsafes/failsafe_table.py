@@ -1,8 +1,9 @@
 """Table of failsafes: condition, parameter, action. One row per failsafe, pure.
 
-Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees). Not
-applicable to this vehicle and omitted: VTOL transitions, ESC arming failure, imbalanced propellers,
-wind limits, and failures of battery, mission and navigator.
+Source: PX4 1.16 to 1.18, commander/failsafe/failsafe.cpp (checkStateAndMode and its callees); the
+differences between these releases are in `FailsafeRules`. Not applicable to this vehicle and
+omitted: VTOL transitions, ESC arming failure, imbalanced propellers, parachutes, wind limits, and
+failures of battery, mission and navigator.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.px4_release import FailsafeRules, px4_release
 from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCause
 from firmware_sim.autopilot.failsafes import failsafe_conditions
 from firmware_sim.autopilot.flight_modes import Mode, Need
@@ -60,12 +62,9 @@ def possible(action: FailsafeAction, conditions: failsafe_conditions.Conditions)
     )
 
 
-def mode_fallback(
-    conditions: failsafe_conditions.Conditions,
-    settings: failsafe_conditions.FailsafeSettings,
-    intended: Mode,
-) -> FailsafeAction:
+def mode_fallback(situation: Situation, intended: Mode) -> FailsafeAction:
     """Return the replacement of an intended mode that cannot run; NONE = it can."""
+    conditions, settings = situation.conditions, situation.settings
     action, mode = FailsafeAction.NONE, intended
     # Replacements in sequence: offboard loss first, then modes that cannot run.
     if conditions.offboard_control_signal_lost and mode.spec.needs & Need.OFFBOARD_SIGNAL:
@@ -74,20 +73,17 @@ def mode_fallback(
             return action
         # From here on, the requirements of the action's mode apply.
         mode = MODE_OF_ACTION[action]
-    if settings.com_posctl_navl == 0:
-        if mode is Mode.POSITION and not failsafe_conditions.can_run(mode, conditions):
-            action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
-        # The replacement itself may be impossible: continue to the next one.
-        if mode is Mode.ALTITUDE and not failsafe_conditions.can_run(mode, conditions):
-            action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
-    elif (
-        settings.com_posctl_navl == 1
-        and mode is Mode.POSITION
-        and not failsafe_conditions.can_run(mode, conditions)
+    if mode is Mode.POSITION and not failsafe_conditions.can_run(mode, conditions):
+        action, mode = FailsafeAction.FALLBACK_ALTCTRL, Mode.ALTITUDE
+    # The replacement itself may be impossible: continue to the next one.
+    if mode is Mode.ALTITUDE and not failsafe_conditions.can_run(mode, conditions):
+        action, mode = FailsafeAction.FALLBACK_STABILIZED, Mode.STABILIZED
+    if (
+        situation.rules.fallback_needs_pilot
+        and conditions.manual_control_signal_lost
+        and FailsafeAction.FALLBACK_POSCTRL <= action <= FailsafeAction.FALLBACK_STABILIZED
     ):
-        action, mode = FailsafeAction.LAND, Mode.LAND
-        if not failsafe_conditions.can_run(mode, conditions):
-            action, mode = FailsafeAction.DESCEND, Mode.DESCEND
+        action = _LINK_LOSS.get(settings.nav_rcl_act, NOTHING).action
     return action if failsafe_conditions.can_run(mode, conditions) else FailsafeAction.RTL
 
 
@@ -109,6 +105,7 @@ class Situation(NamedTuple):
     """Manual control was lost at arming and has not returned: it is optional."""
     battery_at_arming: failsafe_conditions.BatteryWarning = failsafe_conditions.BatteryWarning.NONE
     armed: bool = False
+    rules: FailsafeRules = px4_release().failsafes
 
 
 class Trigger(Enum):
@@ -147,6 +144,8 @@ class Row:
     """Other parameters of the condition."""
     value: Callable[[Situation], int] | None = None
     """Key into `answers` if it differs from the parameter's value."""
+    checked: Callable[[Situation], bool] = lambda _: True
+    """False in situations where the condition does not count."""
 
     def options(self, situation: Situation) -> failsafe_conditions.Options:
         """Return the response if the failsafe is triggered in a situation."""
@@ -161,8 +160,11 @@ class Row:
 
 _STICKS_OFF = 4
 """COM_RC_IN_MODE: stick input disabled."""
-_EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
-"""Bits of COM_RCL_EXCEPT."""
+_EXCEPTIONS = {Mode.MISSION: 1, Mode.HOLD: 2, Mode.TAKEOFF: 2, Mode.OFFBOARD: 4}
+"""Bit of each mode in COM_RCL_EXCEPT and COM_DLL_EXCEPT."""
+
+_AUTO_MODES = (Mode.LAND, Mode.RETURN, Mode.DESCEND, Mode.FOLLOW, Mode.PRECISION_LAND, Mode.ORBIT)
+"""Further modes of Hold's bit since PX4 1.18."""
 
 _NONE, _WARN, _HOLD = (
     NOTHING,
@@ -189,7 +191,7 @@ def _caused(
 
 
 _LANDING = (Mode.LAND, Mode.PRECISION_LAND)
-_LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
+_LINK_LOSS = {0: _NONE, 1: _LASTING_HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
 """Responses of NAV_RCL_ACT and NAV_DLL_ACT."""
 
 _ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=failsafe_conditions.Takeover.MODE_SWITCH)
@@ -219,35 +221,35 @@ _ACTUATOR = {
 }
 
 
+def _exempt(s: Situation, exceptions: int) -> bool:
+    """Return whether the loss of a link is exempt in this mode, by bits of a parameter."""
+    mode = s.intended
+    if s.rules.exceptions_cover_auto_modes and mode in _AUTO_MODES:
+        mode = Mode.HOLD
+    return bool(exceptions & _EXCEPTIONS.get(mode, 0))
+
+
 def ignores_manual_control(s: Situation) -> bool:
     """Return whether the loss of manual control is exempt in this mode (COM_RCL_EXCEPT)."""
-    mode, bits = s.intended, s.settings.com_rcl_except
-    return (
-        s.manual_control_lost_at_arming
-        or (mode is Mode.MISSION and bool(bits & _EXCEPT_MISSION))
-        or (mode in (Mode.HOLD, Mode.TAKEOFF) and bool(bits & _EXCEPT_HOLD))
-        or (mode is Mode.OFFBOARD and bool(bits & _EXCEPT_OFFBOARD))
-    )
+    return s.manual_control_lost_at_arming or _exempt(s, s.settings.com_rcl_except)
 
 
-def _manual_control(s: Situation) -> bool:
-    lost = s.conditions.manual_control_signal_lost and s.settings.com_rc_in_mode != _STICKS_OFF
-    return lost and not ignores_manual_control(s)
+def _uses_manual_control(s: Situation) -> bool:
+    return s.settings.com_rc_in_mode != _STICKS_OFF and not ignores_manual_control(s)
 
 
-def _links_lost_after_mission(s: Situation) -> bool:
-    """Return whether a finished mission has no link and no link failsafe applies."""
+def _uses_ground_station(s: Situation) -> bool:
+    exempt = s.intended in _LANDING or _exempt(s, s.settings.com_dll_except)
+    counts = s.armed or not s.rules.gcs_loss_needs_arming
+    return s.settings.nav_dll_act != 0 and counts and not exempt
+
+
+def _without_links(s: Situation) -> bool:
+    """Return whether a mission is finished and no link failsafe applies."""
     # COM_RC_IN_MODE 4, or the exception for missions: a loss of the sticks does not act.
-    unwatched = s.settings.com_rc_in_mode == _STICKS_OFF or bool(
-        s.settings.com_rcl_except & _EXCEPT_MISSION
-    )
-    return (
-        s.intended is Mode.MISSION
-        and s.mission_finished
-        and unwatched
-        and s.settings.nav_dll_act == 0
-        and s.conditions.gcs_connection_lost
-    )
+    unwatched = s.settings.com_rc_in_mode == _STICKS_OFF or _exempt(s, s.settings.com_rcl_except)
+    finished = s.intended is Mode.MISSION and s.mission_finished
+    return finished and unwatched and s.settings.nav_dll_act == 0
 
 
 def _taking_off(s: Situation) -> bool:
@@ -279,7 +281,7 @@ def _battery_row(
         trigger,
         title,
         "the charge is below its limit, and was not at arming",
-        lambda s: s.conditions.battery_warning is level,
+        lambda _: True,
         {
             value: failsafe_conditions.Options(action, cause=cause)
             for value, action in enumerate(actions)
@@ -288,6 +290,7 @@ def _battery_row(
         failsafe_conditions.Options(FailsafeAction.WARN, cause=cause),
         related=(threshold,),
         value=_battery_action,
+        checked=lambda s: s.conditions.battery_warning is level,
     )
 
 
@@ -298,27 +301,30 @@ TABLE: tuple[Row, ...] = (
         Trigger.MANUAL_CONTROL,
         "Manual control lost",
         "no pilot's input for so long, unless there was none at arming",
-        _manual_control,
+        lambda s: s.conditions.manual_control_signal_lost,
         _caused(_LINK_LOSS, FailsafeCause.MANUAL_CONTROL_LOSS),
         "NAV_RCL_ACT",
         related=("COM_RC_LOSS_T", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
+        checked=_uses_manual_control,
     ),
     Row(
         Trigger.GCS,
         "Ground station lost",
         "no ground station's HEARTBEAT for so long; not in Land or Precision Landing",
-        lambda s: s.conditions.gcs_connection_lost and s.intended not in _LANDING,
+        lambda s: s.conditions.gcs_connection_lost,
         _caused(_LINK_LOSS, FailsafeCause.GCS_CONNECTION_LOSS),
         "NAV_DLL_ACT",
-        related=("COM_DL_LOSS_T",),
+        related=("COM_DL_LOSS_T", "COM_DLL_EXCEPT"),
+        checked=_uses_ground_station,
     ),
     Row(
         Trigger.MISSION_WITHOUT_LINKS,
         "No link after the mission",
         "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
-        _links_lost_after_mission,
+        lambda s: s.conditions.gcs_connection_lost,
         {0: failsafe_conditions.Options(FailsafeAction.RTL)},
         related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
+        checked=_without_links,
     ),
     Row(
         Trigger.FLIGHT_TIME,
@@ -332,15 +338,14 @@ TABLE: tuple[Row, ...] = (
         Trigger.POSITION_ACCURACY,
         "Position accuracy low",
         "the position is valid, but less accurate than asked for, in Mission and Hold",
-        lambda s: (
-            s.intended in (Mode.MISSION, Mode.HOLD) and s.conditions.local_position_accuracy_low
-        ),
+        lambda s: s.conditions.local_position_accuracy_low,
         _POSITION_LOW,
         "COM_POS_LOW_ACT",
         failsafe_conditions.Options(
             FailsafeAction.WARN, takeover=failsafe_conditions.Takeover.MODE_SWITCH
         ),
         related=("COM_POS_LOW_EPH",),
+        checked=lambda s: s.intended in (Mode.MISSION, Mode.HOLD),
     ),
     Row(
         Trigger.GEOFENCE,
@@ -386,25 +391,28 @@ TABLE: tuple[Row, ...] = (
         Trigger.ATTITUDE,
         "Attitude failure at take-off",
         "roll or pitch out of limits, within COM_SPOOLUP_TIME + COM_LKDOWN_TKO of arming",
-        lambda s: s.conditions.fd_critical_failure and _taking_off(s),
+        lambda s: s.conditions.fd_critical_failure,
         {0: failsafe_conditions.Options(FailsafeAction.DISARM)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "COM_LKDOWN_TKO"),
+        checked=_taking_off,
     ),
     Row(
         Trigger.ATTITUDE,
         "Attitude failure in flight, CBRK_FLIGHTTERM 0",
         "roll or pitch out of limits",
-        lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and _terminates(s),
+        lambda s: s.conditions.fd_critical_failure,
         {0: failsafe_conditions.Options(FailsafeAction.TERMINATE)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
+        checked=lambda s: not _taking_off(s) and _terminates(s),
     ),
     Row(
         Trigger.ATTITUDE,
         "Attitude failure in flight",
         "roll or pitch out of limits",
-        lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and not _terminates(s),
+        lambda s: s.conditions.fd_critical_failure,
         {0: _WARN},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
+        checked=lambda s: not _taking_off(s) and not _terminates(s),
     ),
     Row(
         Trigger.MOTOR,
@@ -420,19 +428,18 @@ TABLE: tuple[Row, ...] = (
 """All failsafes except the last, added by `answers`: the fallback of a mode that cannot run."""
 
 
-def answers(situation: Situation) -> list[tuple[Trigger, failsafe_conditions.Options]]:
-    """Return the triggered failsafes with their responses in table order, without NONE."""
-    found = [(row.trigger, row.options(situation)) for row in TABLE if row.occurs(situation)]
-    found = [
-        (trigger, options)
-        for trigger, options in found
-        if options.action is not FailsafeAction.NONE
-    ]
+def answers(situation: Situation) -> dict[Trigger, failsafe_conditions.Options | None]:
+    """Return the checked triggers with their responses; None = no failure.
+
+    As in PX4, responses without an action belong to them: they begin the delay of later ones.
+    """
+    found = {
+        row.trigger: row.options(situation) if row.occurs(situation) else None
+        for row in TABLE
+        if row.checked(situation)
+    }
     # The fallback of a mode is not a table row: it depends on several parameters.
-    fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
-    if fallback is not FailsafeAction.NONE:
-        options = failsafe_conditions.Options(
-            fallback, takeover=failsafe_conditions.Takeover.ALWAYS
-        )
-        found.append((Trigger.MODE_FALLBACK, options))
+    fallback = mode_fallback(situation, situation.intended)
+    always = failsafe_conditions.Options(fallback, takeover=failsafe_conditions.Takeover.ALWAYS)
+    found[Trigger.MODE_FALLBACK] = None if fallback is FailsafeAction.NONE else always
     return found

@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.px4_release import FailsafeRules
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import Health, OperatorText, Setpoint, Severity
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
@@ -24,7 +25,6 @@ from firmware_sim.autopilot.events.definition import FailsafeAction, FailsafeCau
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
 from firmware_sim.autopilot.failsafes import failsafe_conditions, failsafe_table, watch
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    BatteryWarning,
     Clear,
     Conditions,
     FailsafeSettings,
@@ -117,10 +117,15 @@ class Held(NamedTuple):
     """True while the condition persists."""
 
 
+SLOTS = 8
+"""Maximum number of active actions, as in PX4."""
+
+
 class FailsafeState(NamedTuple):
     """State of the failsafe framework."""
 
-    held: tuple[Held, ...] = ()
+    held: tuple[Held | None, ...] = (None,) * SLOTS
+    """Active actions in slots; None = free. Of equal actions, the first names the cause."""
     action: FailsafeAction = FailsafeAction.NONE
     """Active action."""
     taken_over: bool = False
@@ -135,7 +140,7 @@ class FailsafeState(NamedTuple):
     """Remaining time of the current delay in Hold [µs]."""
     armed_us: int | None = None
     manual_control_lost_at_arming: bool = False
-    battery_at_arming: BatteryWarning = BatteryWarning.NONE
+    battery_at_arming: failsafe_conditions.BatteryWarning = failsafe_conditions.BatteryWarning.NONE
 
     @property
     def active(self) -> bool:
@@ -204,7 +209,12 @@ def update(
             choice.action, choice.delayed, choice.cause, now.intended, state.delay_us
         )
     intended = choice.intended
-    if state.active and failsafe_table.mode_of(choice.action, intended) is Mode.ORBIT:
+    if now.rules.orbit_ends_at_once:
+        interrupted = not state.active and choice.action > FailsafeAction.WARN
+    else:
+        mode = failsafe_table.mode_of(choice.action, intended)
+        interrupted = state.active and mode in (intended, Mode.TERMINATION)
+    if interrupted and intended is Mode.ORBIT:
         intended = Mode.HOLD  # Orbit does not resume after an interruption.
     state = state._replace(
         action=choice.action,
@@ -235,9 +245,12 @@ def _begin(state: FailsafeState, now: failsafe_table.Situation, elapsed_us: int)
     return state if lost else state._replace(manual_control_lost_at_arming=False)
 
 
-def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
+def _released(held: tuple[Held | None, ...]) -> tuple[Held | None, ...]:
     """Return the held actions after a mode selection by the user."""
-    return tuple(h for h in held if h.failing or h.options.clear is not Clear.ON_MODE_CHANGE)
+    return tuple(
+        h if h and (h.failing or h.options.clear is not Clear.ON_MODE_CHANGE) else None
+        for h in held
+    )
 
 
 def _hold(state: FailsafeState, now: failsafe_table.Situation) -> tuple[FailsafeState, bool]:
@@ -248,31 +261,48 @@ def _hold(state: FailsafeState, now: failsafe_table.Situation) -> tuple[Failsafe
         battery_at_arming=state.battery_at_arming,
     )
     # One action per trigger; rows of one trigger exclude each other.
-    failing = dict(failsafe_table.answers(now))
-    held: list[Held] = []
-    for item in state.held:
-        answer = failing.pop(item.trigger, None)
-        if answer is not None:
-            # The action may change; end condition and takeover rule stay.
-            held.append(Held(item.trigger, item.options._replace(action=answer.action), True))
-        elif item.options.clear is not Clear.WITH_CONDITION:
-            held.append(item._replace(failing=False))
-    warned = False
+    answers = failsafe_table.answers(now)
+    held, warned, delay_us = list(state.held), False, state.delay_us
     # COM_FAIL_ACT_T up to 0.1 s means no delay, as in PX4.
     waits = now.settings.com_fail_act_t > 0.1
-    delay_us = state.delay_us
-    for trigger, options in failing.items():
+    for trigger in failsafe_table.Trigger:
+        options = answers.get(trigger)
+        place = next((i for i, item in enumerate(held) if item and item.trigger is trigger), None)
+        item = None if place is None else held[place]
+        if place is not None and item is not None:
+            if options is not None:
+                # The action may change; end condition and takeover rule stay.
+                changed = item.options._replace(action=options.action)
+                held[place] = Held(trigger, changed, failing=True)
+            elif trigger in answers:
+                held[place] = _cleared(item)
+            continue
+        if options is None:
+            continue
+        places = [i for i, item in enumerate(held) if item is None] or [
+            i for i, item in enumerate(held) if item and options.action > item.options.action
+        ]
+        if not places:
+            continue
         if options.takeover is Takeover.AUTO:
             if waits and options.action is not FailsafeAction.WARN and delay_us == 0:
                 delay_us = _next_delay(state, now.settings)
             takeover = Takeover.ALWAYS if waits else Takeover.MODE_SWITCH
             options = options._replace(takeover=takeover)
-        held.append(Held(trigger, options, True))
+        # The last free slot, as in PX4.
+        held[places[-1]] = Held(trigger, options, failing=True)
         warned = warned or options.action is FailsafeAction.WARN
         # A new failsafe ends the takeover: the user must confirm it again.
         if options.action >= FailsafeAction.HOLD:
             state = state._replace(taken_over=False)
-    return state._replace(held=tuple(held), delay_us=delay_us), warned
+    # Unchecked failures end after the others.
+    ended = (_cleared(item) if item and item.trigger not in answers else item for item in held)
+    return state._replace(held=tuple(ended), delay_us=delay_us), warned
+
+
+def _cleared(item: Held) -> Held | None:
+    """Return an action whose condition has cleared; None = it ends."""
+    return None if item.options.clear is Clear.WITH_CONDITION else item._replace(failing=False)
 
 
 def _next_delay(state: FailsafeState, settings: FailsafeSettings) -> int:
@@ -303,7 +333,11 @@ def _select(
     # Highest action and strictest takeover rule of all held failsafes.
     worst = Options(FailsafeAction.NONE, takeover=Takeover.ALWAYS)
     strictest = Takeover.ALWAYS
+    # Until PX4 1.17, an action that is switched off counts for the takeover.
+    least = FailsafeAction(now.rules.delays_from // 2)
     for item in state.held:
+        if item is None or item.options.action < least:
+            continue
         strictest = max(strictest, item.options.takeover)
         if item.options.action > worst.action:
             worst = item.options
@@ -314,11 +348,13 @@ def _select(
         state.delay_us > 0
         and not state.taken_over
         and strictest <= Takeover.MODE_SWITCH
+        and now.rules.delays_from <= action
         and action not in (FailsafeAction.DISARM, FailsafeAction.TERMINATE, FailsafeAction.HOLD)
     ):
         delayed, action, strictest = action, FailsafeAction.HOLD, Takeover.MODE_SWITCH
     # A mode switch in the update that starts the action does not end the action.
-    by_mode = intervention.mode_chosen and state.action is action
+    known = state.active if now.rules.takeover_needs_action else state.action is action
+    by_mode = intervention.mode_chosen and known
     takes_over = state.taken_over or by_mode
     if strictest is Takeover.ALWAYS:
         takes_over = takes_over or intervention.sticks_moved
@@ -333,7 +369,7 @@ def _select(
             intended = Mode.POSITION
         action, taken_over, delayed = FailsafeAction.WARN, True, FailsafeAction.NONE
         # The user's mode may be impossible: then its fallback acts.
-        action = max(action, failsafe_table.mode_fallback(now.conditions, now.settings, intended))
+        action = max(action, failsafe_table.mode_fallback(now, intended))
     possible_now = failsafe_table.possible(action, now.conditions)
     if possible_now is not action:
         action, cause = possible_now, _GENERIC
@@ -384,10 +420,11 @@ class Supervisor:
         self,
         value: Callable[[str], float],
         estimator: Estimator,
+        rules: FailsafeRules,
         send_event: Callable[[MavlinkEvent], None] = lambda _event: None,
     ) -> None:
-        """Store the look-up for PX4 parameters, the estimator and the event callback."""
-        self._value = value
+        """Store the look-up for PX4 parameters, estimator, failsafe rules and event callback."""
+        self._value, self._rules = value, rules
         self._estimator = estimator
         self.watch = watch.Watch(value, estimator)
         """Monitors for signals and measurements."""
@@ -605,7 +642,9 @@ class Supervisor:
             return None
         self._decided = seen
         now = Situation(
-            time_us, self.conditions, self._settings, flight.intended, finished, armed=armed
+            *(time_us, self.conditions, self._settings, flight.intended, finished),
+            armed=armed,
+            rules=self._rules,
         )
         outcome = update(state, now, intervention)
         self._state = outcome.state
@@ -613,4 +652,9 @@ class Supervisor:
         followed = replace(
             flight, mode=outcome.mode, intended=outcome.intended, failsafe=outcome.state.active
         )
-        return FailsafeDecision(followed, outcome.text, action is FailsafeAction.DISARM and armed)
+        text = outcome.text
+        if text and action is FailsafeAction.WARN and not self._rules.warning_has_text:
+            if text.event is not None:
+                self._send_event(text.event)
+            text = None
+        return FailsafeDecision(followed, text, action is FailsafeAction.DISARM and armed)

@@ -271,6 +271,8 @@ def handle_set_mode(message: codec.WireMessage, context: services.Context) -> bo
 def _handle(command: services.VehicleCommand, context: services.Context) -> bool:
     # None means no COMMAND_ACK at all: PX4 leaves some commands unanswered.
     action = services.table("ACTIONS").get(command.number)
+    if command.number in context.port.parameters.release.unknown_commands:
+        action = None
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:
         context.link.send(
