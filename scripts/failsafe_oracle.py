@@ -52,7 +52,6 @@ VALUES: Mapping[str, tuple[float, ...]] = {
     "com_dll_except": tuple(range(8)),
     "com_fail_act_t": (0.0, 0.1, 1.0, 5.0),
     "com_fltt_low_act": (0, 1, 3),
-    "com_lkdown_tko": (3.0,),
     "com_low_bat_act": (0, 1, 2, 3),
     "com_obl_rc_act": (0, 1, 2, 3, 4, 5, 6, 7),
     "com_pos_low_act": (0, 1, 2, 3, 4, 5),

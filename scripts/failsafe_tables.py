@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import get_args
 
-from airl_mav.profiles.px4_release import px4_release
+from airl_mav.profiles.px4_release import ParameterSpec, PX4ReleaseName, px4_release
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.events.definition import FailsafeAction, words
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
@@ -19,6 +20,7 @@ from firmware_sim.autopilot.failsafes.failsafe_table import (
     Row,
 )
 from firmware_sim.autopilot.flight_modes import Mode
+from firmware_sim.mavlink.codec import dialect
 
 ACTION_NAMES = {
     FailsafeAction.NONE: "nothing",
@@ -130,6 +132,55 @@ def _told(check: prearm.PrearmCheck) -> str:
     if check.announced:
         return "by itself"
     return "by an event alone" if check.blocks is prearm.never else "when arming is refused"
+
+
+RULES = {
+    "fallback_needs_pilot": "without a pilot, `NAV_RCL_ACT` replaces a fallback to a piloted mode",
+    "exceptions_cover_auto_modes": "`COM_RCL_EXCEPT` and `COM_DLL_EXCEPT` 2: all automatic modes",
+    "gcs_loss_needs_arming": "a ground station's loss counts in an armed vehicle only",
+    "takeover_needs_action": "a mode takes over from any active action",
+    "delays_from": "lowest action that waits in Hold",
+    "orbit_ends_at_once": "a failsafe turns Orbit into Hold at its beginning",
+    "warning_has_text": "a warning has the text Failsafe activated",
+}
+"""Meaning of each rule in the table of releases."""
+
+
+def releases() -> str:
+    """Return what differs between the PX4 releases: parameters in use, failsafes, commands."""
+    names: tuple[PX4ReleaseName, ...] = get_args(PX4ReleaseName)
+    found = [px4_release(name) for name in names]
+    specs = [{spec.current_name: spec for spec in release.specs} for release in found]
+    used = sorted({spec.current_name for each in specs for spec in each.values() if spec.is_used})
+    rows = [("source", *(release.source for release in found))]
+    rows += [("parameters", *(str(len(release.specs)) for release in found))]
+    for name in used:
+        cells = [_cell(each.get(name), name) for each in specs]
+        if len(set(cells)) > 1:
+            rows.append((f"`{name}`", *cells))
+    for rule, text in RULES.items():
+        values = [getattr(release.failsafes, rule) for release in found]
+        rows.append((text, *map(_rule, values)))
+    unknown = [", ".join(_command(n) for n in sorted(each.unknown_commands)) for each in found]
+    rows.append(("unsupported commands", *(text or "–" for text in unknown)))
+    return _table(("", *names), rows)
+
+
+def _cell(spec: ParameterSpec | None, name: str) -> str:
+    if spec is None:
+        return "–"
+    return f"{spec.default:g}" if spec.name == name else f"`{spec.name}` {spec.default:g}"
+
+
+def _rule(value: bool | int) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ACTION_NAMES[FailsafeAction(value)]
+
+
+def _command(number: int) -> str:
+    name: str = dialect.enums["MAV_CMD"][number].name
+    return name.removeprefix("MAV_CMD_")
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
