@@ -53,7 +53,8 @@ MODULES = {
     "limits": ("companion/limits.py", "unit/test_limits.py unit/test_limit_rules.py"),
     "files": (
         "airl_mav/core/files.py",
-        "unit/test_files.py unit/test_run_folder.py unit/test_log_file.py report/test_links.py "
+        "unit/test_file_bounds.py unit/test_files.py unit/test_run_folder.py "
+        "unit/test_log_file.py report/test_links.py "
         "'-knot kill_9 and not a_report and not machine and not checkout and not documentation'",
     ),
     "storage": (
