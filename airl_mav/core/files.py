@@ -86,7 +86,7 @@ def replacing(path: Path, mode: int = 0o666) -> Iterator[Path]:
             sync_folder(path.parent)
     except BaseException:
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            partial.unlink()
         raise
 
 
@@ -238,7 +238,7 @@ def _opened_folder(path: Path) -> Iterator[int]:
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
     """Write a readable JSON file with its CRC. Raises ValueError for a NaN."""
-    text = json.dumps(_sealed(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(_sealed(data), indent=2, ensure_ascii=False) + "\n"
     replace_file(path, text.encode())
 
 
@@ -631,7 +631,7 @@ class LogFile:
         with suppress(OSError):
             self._file.close()
         with suppress(OSError):
-            self.partial_path.unlink(missing_ok=True)
+            self.partial_path.unlink()
 
     def _end(self, error: OSError, whole: int) -> None:
         """Stop writing, and truncate the file to its complete records of `whole` bytes."""
