@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
+from airl_mav.flight.judge import Effect, Outcome, Referee, Task, TruthSample
 
 TASK = Task(goal=(30.0, 40.0), goal_radius_m=2.0, time_limit_s=60.0)
 FAR = (0.0, 0.0, -2.0)
@@ -147,3 +147,15 @@ def test_navigation_begins_once() -> None:
 def test_a_task_nobody_can_do_is_refused(task: Task) -> None:
     with pytest.raises(ValueError, match="must be > 0"):
         Referee(task)
+
+
+def test_an_effect_is_one_line_with_its_times() -> None:
+    effect = Effect("udp", "10.0.0.7", 255, 190, "PARAM_SET MPC_XY_P", 1, 3_540_000, False, 1, 2.5)
+    assert effect.line(2_000_000) == (
+        "udp 10.0.0.7, system 255 component 190, PARAM_SET MPC_XY_P from 1 to 2.5"
+        " (once, first 1.5 s after the reset)"
+    )
+    twice = Effect("serial", "", 1, 2, "SET_MODE", 2, 3_540_000, False)
+    assert twice.line(0) == (
+        "serial, system 1 component 2, SET_MODE (2 times, first 3.5 s after the reset)"
+    )

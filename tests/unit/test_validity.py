@@ -61,6 +61,11 @@ def test_what_was_given_up_is_a_share_of_all_that_passed() -> None:
     )
 
 
+def test_a_flight_of_no_time_has_given_up_what_passed() -> None:
+    assert figures(flight_us=0, slipped_us=0).given_up == 0.0
+    assert figures(flight_us=0, slipped_us=1).given_up == 1.0
+
+
 def test_a_host_at_half_the_speed_is_named() -> None:
     assert host_faults(figures(wall_s=5.0)) == (
         "flown at 50 % of the speed asked for (limit 95 %)",
