@@ -372,7 +372,7 @@ def moved() -> dict[str, dict[str, list[float]]]:
     found = {}
     for seed, demand in enumerate(DEMANDS, start=20):
         vehicle = craft(seed, demand)
-        assert vehicle.fly(6) == (6, ticks.NONE)
+        assert vehicle.fly(7) == (7, ticks.NONE)
         found[demand] = pinned(vehicle)
     vehicle = craft(1, "rates")
     for name, motors in (("pushed", (0.2, 0.9, 0.4, 0.7)), ("rested", (0.0, 0.1, 0.0, 0.2))):
@@ -394,15 +394,18 @@ def test_motion_and_power_are_the_recorded_ones() -> None:
             )
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_turn_past_half_a_turn_keeps_the_first_component_positive(sign: float) -> None:
+@pytest.mark.parametrize("spin", [-2.0, 2.0])
+def test_an_attitude_has_a_first_component_of_at_least_zero(spin: float) -> None:
     vehicle = craft(1, "idle")
-    vehicle.aircraft["motion"][0, 6:13] = 1e-4, 0.0, 0.0, sign, 0.0, 0.0, sign * 2.0
+    vehicle.aircraft["motion"][0, 6:10] = before = np.array([1e-3, 0.6, -0.36, math.sqrt(0.5104)])
+    vehicle.aircraft["motion"][0, 10:13] = 0.0, 0.0, spin
     vehicle.controller["gps"] = vehicle.controller["compass"] = record.OFF
     assert vehicle.fly(1)[0] == 1
-    w, _, _, z = vehicle.a["motion"][6:10]
-    assert w == pytest.approx(math.sin(0.5 * 2.0 * TICK_S) - 1e-4, rel=1e-2)
-    assert z == pytest.approx(-sign, rel=1e-3)
+    c, s = math.cos(0.5 * spin * TICK_S), math.sin(0.5 * spin * TICK_S)
+    w, x, y, z = before
+    after = np.array([c * w - s * z, c * x + s * y, c * y - s * x, c * z + s * w])
+    assert (after[0] < 0.0) == (spin > 0.0)
+    np.testing.assert_allclose(vehicle.a["motion"][6:10], after * -np.sign(spin), atol=1e-4)
 
 
 @pytest.mark.parametrize("rate_hz", [240, 250, 1000])
@@ -483,6 +486,22 @@ def test_a_tick_with_contacts_begins_and_ends_like_a_compiled_one() -> None:
     vehicle.aircraft["room_m"] = whole.aircraft["room_m"]
     vehicle.aircraft["noise_at"] = whole.aircraft["noise_at"]
     assert vehicle.bytes() == whole.bytes()
+
+
+@pytest.mark.parametrize("standing", [False, True])
+def test_the_plant_ends_a_tick_of_any_motion(standing: bool) -> None:
+    vehicle = craft(5)
+    whole, other = vehicle.copy(), vehicle.copy()
+    assert whole.fly(1) == (1, ticks.NONE)
+    motors = tuple(whole.c["motors"].tolist())
+    ticks.push_record(other.aircraft, motors, vehicle.wind[0])
+    ticks.finish_record(other.aircraft, whole.a["motion"].copy(), vehicle.wind[0], standing)
+    expected = pinned(whole) | {"room_m": [60.0]}
+    if standing:
+        assert other.a["acceleration"].tolist() == [0.0] * 3
+        assert other.a["power_w"] != whole.a["power_w"]
+        expected = {name: expected[name] for name in ("motion", "speeds", "room_m", "held")}
+    assert expected.items() <= pinned(other).items()
 
 
 def ended(vehicle: Craft, *, standing: bool = False) -> int:

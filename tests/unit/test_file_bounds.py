@@ -240,6 +240,7 @@ def test_folders_that_killed_processes_left_are_removed(
         (scratch / name).mkdir()
         (scratch / name / "file").write_bytes(b"x")
     (scratch / "mine-file").write_bytes(b"x")
+    os.mkfifo(scratch / "mine-pipe")  # to open it could last forever
     (scratch / "mine-link").symlink_to(scratch / "theirs-left")
     with monkeypatch.context() as patch:
         patch.setattr(os, "getuid", lambda: scratch.stat().st_uid + 1)
@@ -249,6 +250,7 @@ def test_folders_that_killed_processes_left_are_removed(
         assert not (scratch / "mine-left").exists()
     assert (scratch / "theirs-left" / "file").exists()
     assert (scratch / "mine-file").exists()
+    assert (scratch / "mine-pipe").exists()
     assert (scratch / "mine-link").is_symlink()
 
 
