@@ -416,6 +416,15 @@ def test_the_checksum_of_a_group_is_that_of_its_names_and_members(tmp_path: Path
     assert files.read_groups(tmp_path / "none.npz", {"0"}) == {}
 
 
+def test_arrays_are_packed_at_the_fastest_level(tmp_path: Path) -> None:
+    array = np.cumsum(np.random.default_rng(0).integers(0, 9, 5000))
+    files.add_arrays(tmp_path / "x.npz", {"0": {"a": array}})
+    deflate = [zlib.compressobj(level, zlib.DEFLATED, -15) for level in (1, 2)]
+    one, two = (each.compress(npy(array)) + each.flush() for each in deflate)
+    assert one != two
+    assert one in (tmp_path / "x.npz").read_bytes()
+
+
 def test_archives_are_read_inside_of_their_folder_alone(tmp_path: Path) -> None:
     path = tmp_path / "run" / "x.npz"
     path.parent.mkdir()

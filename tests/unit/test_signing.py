@@ -145,6 +145,14 @@ def test_after_one_signed_frame_no_unsigned_one_counts() -> None:
     assert all(map(ours.accepts, beats))
 
 
+def test_a_new_key_has_no_frames_of_an_earlier_program() -> None:
+    ours = signing()
+    ours.floor = NOW + 2
+    assert not ours.accepts(messages()[0].pack(peer()))
+    ours.change(OTHER)
+    assert ours.accepts(messages()[0].pack(peer(OTHER)))
+
+
 def test_own_frames_do_not_come_back() -> None:
     ours = signing()
     frame = ours.sign(messages()[0].pack(dialect.MAVLink(None, 1, 1)), 0)
