@@ -470,6 +470,17 @@ def test_arrays_may_be_eight_times_the_file_or_200_mebibytes(packed: int, most: 
             archive.start_dir = 0
 
 
+def test_an_archive_that_inflates_too_much_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "x.npz"
+    files.add_arrays(path, {"0": {"a": np.zeros(5000)}})
+    assert files.read_groups(path, {"0"})["0"].arrays["a"].size == 5000
+    monkeypatch.setattr(files, "INFLATED_BYTES", 40_000)
+    with pytest.raises(UsageError, match=r"x\.npz: damaged: 40,128 bytes of arrays; accepted"):
+        files.read_groups(path, {"0"})
+
+
 def member(name: bytes, data: bytes, extra: bytes = b"", *, large: bool = False) -> bytes:
     """Return a stored member of an archive by the ZIP specification: head, name, extra, data."""
     size = b"\xff" * 8 if large else len(data).to_bytes(4, "little") * 2
