@@ -520,6 +520,14 @@ def test_members_are_found_by_their_heads(tmp_path: Path) -> None:
     assert list(files.read_groups(path, {"0"})) == ["0"]
 
 
+def test_a_head_alone_is_a_member(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    path.write_bytes(member(b"0/a.npy", npy(np.arange(5))) + member(b"", b""))
+    files.close_archive(path, {"0", ""})
+    with zipfile.ZipFile(path) as archive:
+        assert archive.namelist() == ["0/a.npy", ""]
+
+
 def test_a_name_of_other_bytes_is_damage(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     path.write_bytes(member(b"0/\xff.npy", npy(np.arange(5))))
