@@ -87,7 +87,7 @@ def flown_steps(aircraft: Aircraft, seed: int) -> dict[str, telemetry.StepRespon
         def hold(leg: telemetry.HeldSetpoint) -> None:
             """Send a setpoint and wait."""
             frame, *values = leg.setpoint
-            offboard: Any = stage.link._offboard  # noqa: SLF001 (the link has no NED setpoints)
+            offboard: Any = stage.link._offboard  # the link sends no NED setpoints
             sent.append((leg, stage.clock.time_us() / US_PER_S))
             if frame == "ned":
                 offboard.set_velocity_ned(VelocityNedYaw(*values))

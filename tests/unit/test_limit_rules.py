@@ -11,7 +11,7 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.policy.observation import Kinematics
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.frame_source import ReceivedFrame
@@ -225,7 +225,29 @@ def test_a_vehicle_that_looks_left_and_right_is_believed(check_s: float) -> None
         assert limits.broken(status, now, round(t_s * US_PER_S)) is None
 
 
-@pytest.mark.parametrize(("speed", "late_s", "ends"), [(1.0, 0.9, 0), (1.0, 1.1, 1), (8.0, 1.9, 0)])
+@pytest.mark.parametrize("braking", [False, True])
+def test_an_acceleration_that_the_tilt_explains_is_believed(braking: bool) -> None:
+    limits, status, sign = (
+        vehicle(),
+        VehicleStatus(True, True, "offboard"),
+        -1.0 if braking else 1.0,
+    )
+    acceleration = sign * 3.0
+    tilt = np.array(turned(1, -math.atan(acceleration / GRAVITY_M_S2)))
+    start_m_s = 4.5 if braking else 0.0
+    for t_s in np.arange(0.0, 1.51, 0.1):
+        noise = 1e-4 * math.sin(7.0 * t_s)
+        north_m = start_m_s * t_s + 0.5 * acceleration * t_s**2
+        position = np.array([north_m, 0.0, -2.5]) + noise
+        velocity = np.array([start_m_s + acceleration * t_s, 0.0, 0.0]) + noise
+        now = Kinematics(position, velocity, tilt + noise, np.full(3, noise))
+        assert limits.broken(status, now, round(t_s * US_PER_S)) is None
+
+
+@pytest.mark.parametrize(
+    ("speed", "late_s", "ends"),
+    [(1.0, 0.9, 0), (1.0, 1.0, 0), (1.0, 1.000001, 1), (8.0, 1.9, 0)],
+)
 def test_stamps_may_be_late_by_a_second_of_the_host(speed: float, late_s: float, ends: int) -> None:
     status = VehicleStatus(True, True, "offboard")
     limits = VehicleLimits(LimitSettings(), (25.0, 0.0), PilotSettings(altitude_m=2.5), speed)
