@@ -11,6 +11,7 @@ real PX4 does not answer take seconds each, and require --slow.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -32,6 +33,7 @@ def main() -> int:
     parser.add_argument("--system", type=int, default=1, help="MAVLink system id of the vehicle")
     parser.add_argument("--area", help="only the calls of this area")
     parser.add_argument("--slow", action="store_true", help="also the calls that time out")
+    parser.add_argument("--json", type=Path, help="file for the answers")
     asked = parser.parse_args()
     configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
     mavsdk = Mavsdk(configuration)
@@ -39,21 +41,26 @@ def main() -> int:
         parser.error(f"--connect {asked.connect}: cannot be used")
     companion = Companion(mavsdk)
     vehicle = Vehicle(companion, asked.system)
-    differ = made = 0
+    differ, answers = 0, []
     for row in ROWS:
         if (row.slow and not asked.slow) or asked.area not in (None, row.area):
             continue
         began = time.monotonic()
         answer = answered(row, vehicle)
         took_s = time.monotonic() - began
-        made += 1
         differ += not answer.agrees
         mark = "agrees " if answer.agrees else "DIFFERS"
         shown = "" if answer.value is None else f"  {answer.value!s:.60}"
         line = f"{mark}  {row.name:<55} PX4 {row.expected[0]:<20} {took_s:6.2f} s  {answer.outcome}"
         print(line + shown, flush=True)
-    print(f"{made - differ} of {made} calls answered as by PX4 1.16")
+        value = None if answer.value is None else f"{answer.value!s:.200}"
+        answers.append(
+            {"name": row.name, "outcome": answer.outcome, "agrees": answer.agrees, "value": value}
+        )
+    print(f"{len(answers) - differ} of {len(answers)} calls answered as by PX4 1.16")
     companion.destroy()
+    if asked.json is not None:
+        asked.json.write_text(json.dumps(answers, indent=1) + "\n")
     return 1 if differ else 0
 
 
