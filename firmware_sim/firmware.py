@@ -81,6 +81,9 @@ class FlightStack(Protocol):
     raise.
     """
 
+    version: str
+    """Name and version of real firmware; empty for the built-in autopilot."""
+
     def boot(self, setup: EpisodeSetup) -> interfaces.FlightController:
         """Boot the flight controller of an episode and wait until it accepts steps.
 
@@ -135,6 +138,8 @@ class FlightStack(Protocol):
 
 class BuiltinFlightStack:
     """Built-in autopilot with the built-in MAVLink server. Implements `FlightStack`."""
+
+    version = ""
 
     def __init__(self, server: MavlinkServer, keeper: Keeper | None = None) -> None:
         """Use the server's links; `keeper` stores parameters set by users, None = not stored."""

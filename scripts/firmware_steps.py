@@ -1,9 +1,11 @@
 """Step responses of a flight controller in lockstep, by the true state at every tick.
 
-    python scripts/firmware_steps.py [--px4-dir DIR] [--px4-release 1.17] [--seeds 3] [--json FILE]
+    python scripts/firmware_steps.py [--px4-dir DIR] [--estimated] [--seeds 3] [--json FILE]
 
-Flies the steps of `airl conformance` with a real PX4, or with the built-in flight controller, on the
-same simulated vehicle. A step's time counts from the companion's call of MAVSDK.
+Flies the steps of `airl conformance` with a real PX4, or with the built-in flight controller, on
+the same simulated vehicle. A step's time counts from the companion's call of MAVSDK. With
+--estimated, the figures are those of LOCAL_POSITION_NED and ATTITUDE at 100 Hz, as in the stored
+columns.
 """
 
 from __future__ import annotations
@@ -11,20 +13,21 @@ from __future__ import annotations
 import json
 import sys
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 from mavsdk.plugins.offboard import VelocityBodyYawspeed, VelocityNedYaw
+from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.addons.conformance import telemetry
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import new_console
 from airl_mav.lockstep.stage import LockstepStage
-from airl_mav.lockstep.vehicle import builtin_vehicle, real_vehicle
+from airl_mav.lockstep.vehicle import VehicleEnd, builtin_vehicle, real_vehicle
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.rotation import yaw_of
@@ -49,6 +52,9 @@ class Command:
 
     instance: int = 0
     """First instance that is tried."""
+
+    estimated: bool = False
+    """Measure by the vehicle's telemetry."""
 
     json: Path | None = None
     """File for the figures."""
@@ -77,17 +83,71 @@ class Truth:
         )
 
 
-def flown_steps(aircraft: Aircraft, seed: int) -> dict[str, telemetry.StepResponse]:
+ESTIMATED = (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, dialect.MAVLINK_MSG_ID_ATTITUDE)
+INTERVAL_US = 10_000
+
+
+class Telemetry(VehicleEnd):
+    """Estimated motion of a flight, in front of the vehicle's end of the link."""
+
+    def __init__(self, end: VehicleEnd) -> None:
+        self._end = end
+        self.answers_later = end.answers_later
+        self.deliver, self.settle = end.deliver, end.settle
+        self._mav = dialect.MAVLink(None, srcSystem=245, srcComponent=190)
+        self._rows: dict[int, list[tuple[float, ...]]] = {number: [] for number in ESTIMATED}
+        self._system = 1
+
+    def ask(self) -> None:
+        """Request the messages."""
+        for number in ESTIMATED:
+            message = dialect.MAVLink_command_long_message(
+                *(self._system, 1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0),
+                *(number, INTERVAL_US, 0, 0, 0, 0, 0),
+            )
+            self._end.deliver(message.pack(self._mav), lambda: None, echo=False)
+
+    def take(self) -> list[bytes]:
+        """Return the received frames."""
+        return self._read(self._end.take())
+
+    def after_tick(self, *, expected: bool) -> list[bytes]:
+        """Return the received frames, see `VehicleEnd`."""
+        return self._read(self._end.after_tick(expected=expected))
+
+    def motion(self) -> telemetry.EstimatedMotion:
+        """Return the estimated motion."""
+        return telemetry.EstimatedMotion(*(np.array(self._rows[number]) for number in ESTIMATED))
+
+    def _read(self, frames: list[bytes]) -> list[bytes]:
+        for frame in frames:
+            self._system = frame[5]
+            number = int.from_bytes(frame[7:10], "little")
+            if number in ESTIMATED and frame[6] == telemetry.AUTOPILOT_COMPONENT:
+                (m,) = self._mav.parse_buffer(frame)
+                row = (m.yaw, m.yawspeed)
+                if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+                    row = (m.x, m.y, m.z, m.vx, m.vy, m.vz)
+                self._rows[number].append((m.time_boot_ms / 1e3, *row))
+        return frames
+
+
+def flown_steps(
+    aircraft: Aircraft, seed: int, *, estimated: bool = False
+) -> dict[str, telemetry.StepResponse]:
     """Return the responses of one flight, by step."""
     vehicle = load_vehicle(aircraft.vehicle)
     conducted = real_vehicle(aircraft, vehicle) or builtin_vehicle(SimClock())
+    heard = Telemetry(conducted.end)
+    conducted = replace(conducted, end=heard)
     truth, sent = Truth(), list[tuple[telemetry.HeldSetpoint, float]]()
     with LockstepStage(vehicle=conducted) as stage:
 
         def hold(leg: telemetry.HeldSetpoint) -> None:
             """Send a setpoint and wait."""
             frame, *values = leg.setpoint
-            offboard: Any = stage.link._offboard  # the link sends no NED setpoints
+            # The link has no NED setpoints.
+            offboard: Any = stage.link._offboard
             sent.append((leg, stage.clock.time_us() / US_PER_S))
             if frame == "ned":
                 offboard.set_velocity_ned(VelocityNedYaw(*values))
@@ -102,6 +162,8 @@ def flown_steps(aircraft: Aircraft, seed: int) -> dict[str, telemetry.StepRespon
             link.arm(60.0, stop)
             link.takeoff(ALTITUDE_M, 60.0, stop)
             link.enter_offboard()
+            if estimated:
+                heard.ask()
             hold(telemetry.HeldSetpoint(telemetry.STOP_NED, SETTLE_S))
             for leg in telemetry.plan(telemetry.STEP_NAMES, mirrored=seed % 2 == 0):
                 hold(leg)
@@ -110,7 +172,7 @@ def flown_steps(aircraft: Aircraft, seed: int) -> dict[str, telemetry.StepRespon
 
         stage.firmware.on_ticks = truth.add
         stage.run(EpisodeSetup(vehicle, None, seed, aircraft=aircraft), program)
-    motion, responses = truth.motion(), {}
+    motion, responses = heard.motion() if estimated else truth.motion(), {}
     for leg, sent_s in sent:
         if leg.step is not None:
             part = motion.between(sent_s - telemetry.BEFORE_S, sent_s + leg.seconds)
@@ -118,9 +180,11 @@ def flown_steps(aircraft: Aircraft, seed: int) -> dict[str, telemetry.StepRespon
     return responses
 
 
-def mean_steps(aircraft: Aircraft, seeds: int) -> dict[str, telemetry.StepResponse]:
+def mean_steps(
+    aircraft: Aircraft, seeds: int, *, estimated: bool = False
+) -> dict[str, telemetry.StepResponse]:
     """Return the mean responses of several flights, by step."""
-    flights = [flown_steps(aircraft, seed) for seed in range(1, seeds + 1)]
+    flights = [flown_steps(aircraft, seed, estimated=estimated) for seed in range(1, seeds + 1)]
     return {
         name: telemetry.StepResponse(*np.mean([each[name] for each in flights], axis=0).tolist())
         for name in flights[0]
@@ -135,13 +199,14 @@ def main(command: Command) -> int:
         real={"px4_dir": command.px4_dir, "instance": command.instance},
         **firmware,
     )
-    found = mean_steps(aircraft, command.seeds)
+    found = mean_steps(aircraft, command.seeds, estimated=command.estimated)
     console = new_console(soft_wrap=True)
     for name, step in found.items():
         console.print(
             f"{name:14} latency {1e3 * step.latency_s:4.0f} t10 {1e3 * step.t10_s:4.0f} t50 "
             f"{1e3 * step.t50_s:5.0f} rise {1e3 * step.rise_s:5.0f} ms  overshoot "
-            f"{step.overshoot_percent:5.1f} %  error {step.error:5.2f}  settle {step.settle_s:4.2f} s"
+            f"{step.overshoot_percent:5.1f} %  error {step.error:5.2f}  "
+            f"settle {step.settle_s:4.2f} s"
         )
     if command.json is not None:
         plain = {name: step._asdict() for name, step in found.items()}

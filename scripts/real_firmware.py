@@ -265,7 +265,7 @@ def steps(command: Command, firmware: Firmware) -> dict[str, Any]:
     elif firmware.release is not None:
         argv += ["--px4-release", firmware.release]
     found = folder / "steps.partial"
-    run([*argv, "--instance", str(command.instance), "--json", str(found)], folder / "steps.log")
+    run([*argv, "--json", str(found)], folder / "steps.log")
     return read(found)
 
 
@@ -331,7 +331,7 @@ def paired(command: Command, firmware: Firmware) -> dict[str, Any]:
         argv = [
             *("-m", "airl_mav.cli.main", "evaluate", policy, "--level", "lockstep"),
             *("--episodes", str(command.seeds), "--seed", "1", "--workers", "1"),
-            *("--instance", str(command.instance), "--out", str(folder), *firmware.options),
+            *("--out", str(folder), *firmware.options),
         ]
         run(argv, folder.with_suffix(".log"))
         episodes = load(folder).episodes

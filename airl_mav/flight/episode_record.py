@@ -126,6 +126,8 @@ class EpisodeRecord:
     whose obstacles started at the reset."""
     sha256: dict[str, str] | None = None
     """Hashes by lane, and of the whole `flight`; None if flights are not reproducible."""
+    firmware: str = ""
+    """Name and version of real firmware; empty for the built-in autopilot."""
     code: str | None = None
     """Identity of the code that flew it (`core.machine.code_of`); None for recorded flights."""
     schema: int = SCHEMA

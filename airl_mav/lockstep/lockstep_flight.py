@@ -328,6 +328,7 @@ class LockstepFlight:
             wall_s=None,
             slipped_us=0,
             battery_remaining=battery,
+            firmware=self._stage.firmware.flight_stack.version,
             notes=(*self._notes, *result.notes, *self._stage.firmware.logs_lost),
             faults=episode.faults_of(arrays),
             sha256=self._fingerprint(),

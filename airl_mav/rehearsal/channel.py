@@ -126,6 +126,8 @@ class Loaded(_Line):
     slipped_us: int
     """Simulated time skipped before the episode because the host could not keep up [µs]."""
     goal: Goal
+    firmware: str = ""
+    """Name and version of real firmware; empty for the built-in autopilot."""
 
 
 class State(_Line):

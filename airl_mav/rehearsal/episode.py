@@ -247,6 +247,7 @@ def _record(
         index=episode.index,
         seed=episode.seed,
         goal=loaded.goal,
+        firmware=loaded.firmware,
         started_us=loaded.time_us,
         wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
         slipped_us=state.slipped_us - loaded.slipped_us if state else 0,

@@ -180,6 +180,7 @@ class Service:
                 epoch_ns=loaded.epoch_ns,
                 slipped_us=self._firmware.slipped_us,
                 goal=arena.goal_point,
+                firmware=self._firmware.flight_stack.version,
             )
         )
 

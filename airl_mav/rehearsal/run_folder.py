@@ -209,7 +209,13 @@ class RunFolder:
             self.path.rmdir()
 
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
-        """Save episodes: the arrays, then the lines with their CRC, which commit them."""
+        """Save episodes: the arrays, then the lines with their CRC, which commit them.
+
+        `run.json` gets the version of real firmware, which is unknown before the first flight.
+        """
+        info, firmware = self.path / RUN_FILE, episodes[-1].record.firmware
+        if firmware and (held := load_info(self.path)).setup.firmware != firmware:
+            _write_info(info, replace(held, setup=replace(held.setup, firmware=firmware)))
         groups = {f"{episode.record.index:03d}": episode for episode in episodes}
         paths = {group: episode.trajectory.arrays() for group, episode in groups.items()}
         stamps = {group: episode.latency for group, episode in groups.items()}

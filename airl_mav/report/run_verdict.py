@@ -118,9 +118,10 @@ def judge_run(
     if injection.latency is not None:
         machine += f" with {moments(injection.latency)} of {injection.origin} latency"
     conditions = f" ({setup.conditions})" if setup.conditions else ""
+    firmware = "".join(f", {name}" for name in {each.firmware: 0 for each in episodes} if name)
     sentence = (
         f"{setup.policy.name} on {machine} in {Path(setup.arena.name).stem}{conditions},"
-        f" level {setup.level}: {_reached(rate, episodes)}"
+        f" level {setup.level}{firmware}: {_reached(rate, episodes)}"
     )
     if against is not None:
         sentence += _gap_words(against, reference)

@@ -10,11 +10,11 @@ from pathlib import Path
 from airl_mav.core.addons import load
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
+from airl_mav.profiles.loading import stored_release
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim import interfaces, simulation
-from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
-from firmware_sim.autopilot.commander import CommanderState
+from firmware_sim.autopilot import autopilot_state, commander
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.parameters import GROUND_LOSS, differences
@@ -80,16 +80,16 @@ class ExternalFlightController:
         self.use_truth = bridge.use_truth
 
     @property
-    def on_message(self) -> Callable[[OperatorText], None] | None:
+    def on_message(self) -> Callable[[autopilot_state.OperatorText], None] | None:
         """Callback for every operator text; None = no callback."""
         return self._observer.on_message
 
     @on_message.setter
-    def on_message(self, call: Callable[[OperatorText], None] | None) -> None:
+    def on_message(self, call: Callable[[autopilot_state.OperatorText], None] | None) -> None:
         self._observer.on_message = call
 
     @property
-    def flight(self) -> CommanderState:
+    def flight(self) -> commander.CommanderState:
         """Phase and mode from the heartbeat, with the armed state from the faster bridge."""
         return self._observer.flight(armed=self._bridge.armed)
 
@@ -145,6 +145,7 @@ class ExternalFlightStack:
         self._timeout_s = timeout_s
         self._missing: list[str] = []
         """Names of parameters still missing."""
+        self.version = launcher.airframe.firmware
         self.filenos = observer.filenos
         self._look_every_us, self._look_us = look_every_us, 0
         self.send = observer.send
@@ -194,6 +195,13 @@ class ExternalFlightStack:
         self._until(tick, self._asking(lambda: parameters.ask(names)), "the parameters")
         # If the loss of a ground station triggers an action, it must do so in a rehearsal too.
         observer.acts_as_ground_station = not parameters.values.get(GROUND_LOSS, 0)
+        if observer.version is not None:
+            self.version = stored_release(airframe.firmware, observer.version)[1]
+        if lacking := sorted(parameters.absent.difference(airframe.also_read)):
+            raise interfaces.FirmwareMissingError(
+                f"{self.version} has no parameter {_some(lacking)}: remove it from the vehicle's"
+                " profile, or fly a release that has it"
+            )
         problem = airframe.problem(parameters.values)
         if problem is not None:
             raise interfaces.FirmwareMissingError(problem)
@@ -203,6 +211,7 @@ class ExternalFlightStack:
         elif different := differences(parameters.values, airframe.settings):
             self._say(f"{airframe.firmware} is not configured as the vehicle: {_some(different)}")
         self._until(tick, lambda: observer.ready, "its report that it may be armed")
+        self._say(self.version, autopilot_state.Severity.INFO)
 
     def close(self) -> None:
         """Stop the firmware if it was started here, and close the observer."""
@@ -246,9 +255,11 @@ class ExternalFlightStack:
                     f"{observer.last_text or 'nothing'}"
                 )
 
-    def _say(self, text: str) -> None:
+    def _say(
+        self, text: str, severity: autopilot_state.Severity = autopilot_state.Severity.WARNING
+    ) -> None:
         if self._observer.on_message is not None:
-            self._observer.on_message(OperatorText(Severity.WARNING, text))
+            self._observer.on_message(autopilot_state.OperatorText(severity, text))
 
 
 def _some(items: Sequence[str]) -> str:

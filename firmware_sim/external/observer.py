@@ -119,6 +119,8 @@ class FirmwareObserver:
         """Reset all state before another firmware starts."""
         self._now_us = 0
         self._heard: WireMessage | None = None
+        self.version: int | None = None
+        """AUTOPILOT_VERSION.flight_sw_version; None before it is known."""
         self._landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
         self._ready = False
         self._located = False
@@ -193,6 +195,8 @@ class FirmwareObserver:
         if now_us - self._asked_us < ASK_EVERY_US:
             return
         self._asked_us = now_us
+        if self.version is None:
+            self._command(dialect.MAV_CMD_REQUEST_MESSAGE, message_id("AUTOPILOT_VERSION"))
         if self._origin is not None and self._located and not self._ready:
             # PX4 boots into Hold and cannot arm there without an origin. An origin sent before PX4
             # has estimated a position would shift that position.
@@ -242,6 +246,10 @@ class FirmwareObserver:
             self._say(message)
         elif name == "PARAM_VALUE":
             self.parameters.take(message)
+        elif name == "PARAM_ERROR" and message.error == dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST:
+            self.parameters.absent.add(str(message.param_id))
+        elif name == "AUTOPILOT_VERSION":
+            self.version = int(message.flight_sw_version)
         else:
             return False
         return True
@@ -289,6 +297,10 @@ BURST = 10
 """Maximum number of requests sent at once, as the link may be slow."""
 
 
+SILENT_REQUESTS = 12
+"""Requests without an answer after which firmware that has answered others lacks a parameter."""
+
+
 _INTEGERS = {
     dialect.MAV_PARAM_TYPE_INT8: "<b3x",
     dialect.MAV_PARAM_TYPE_UINT8: "<B3x",
@@ -312,6 +324,9 @@ class ParameterClient:
         self._bytewise = True
         self._values: dict[str, Value] = {}
         self._kinds: dict[str, int] = {}
+        self._unanswered = 0
+        self.absent: set[str] = set()
+        """Parameters that the firmware lacks."""
 
     values = property(lambda self: self._values)
     """Values received so far, by name."""
@@ -323,7 +338,7 @@ class ParameterClient:
 
     def take(self, message: WireMessage) -> None:
         """Store the value of a PARAM_VALUE message."""
-        name, kind = str(message.param_id), int(message.param_type)
+        name, kind, self._unanswered = str(message.param_id), int(message.param_type), 0
         self._kinds[name] = kind
         if kind not in _INTEGERS:
             self._values[name] = float(message.param_value)
@@ -335,7 +350,12 @@ class ParameterClient:
 
     def ask(self, names: Iterable[str]) -> list[str]:
         """Request up to `BURST` unknown parameters; return the names of all unknown ones."""
-        missing = [name for name in names if name not in self._values]
+        missing = [name for name in names if name not in {*self._values, *self.absent}]
+        self._unanswered += 1
+        if self._values and self._unanswered > SILENT_REQUESTS:
+            # PX4 before 1.18 does not answer a request for a parameter that it lacks.
+            self.absent.update(missing[:BURST])
+            self._unanswered, missing = 0, missing[BURST:]
         if self._target is not None:
             for name in missing[:BURST]:
                 self._send(

@@ -32,7 +32,7 @@ def setpoint_response(records: Records) -> str:
     flown = records["response-taken-apart"].printed
     assert flown is not None
     rows = [[f"built-in: {stage}", *cells] for stage, *cells in flown.rows]
-    steps = load_profile("conformance", "px4", Reference).steps
+    steps = load_profile("conformance", "px4-1.16", Reference).steps
     north, up = steps["north-2"], steps["up-2"]
     rows.append([f"PX4: estimated velocity moved by {1e3 * MOVED_M_S:g} mm/s"])
     rows[-1] += [_ms(north.latency_s), _ms(up.latency_s)]

@@ -42,7 +42,12 @@ from firmware_sim.external.launcher import (
     StartCommand,
     WorkingFolders,
 )
-from firmware_sim.external.observer import FirmwareObserver, ParameterClient, flight_of
+from firmware_sim.external.observer import (
+    SILENT_REQUESTS,
+    FirmwareObserver,
+    ParameterClient,
+    flight_of,
+)
 from firmware_sim.external.parameters import (
     SITL_OUTPUT,
     RequiredAirframe,
@@ -277,6 +282,44 @@ def test_parameters_are_asked_for_in_bursts_until_they_came() -> None:
     assert client.ask(names) == names[10:]
 
 
+def test_a_parameter_that_the_firmware_lacks_is_known_at_once() -> None:
+    far = Far()
+    client = far.observer.parameters
+    assert client.ask(["A", "GONE"]) == ["A", "GONE"]
+    missing = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
+    far.hear(dialect.MAVLink_param_error_message(254, 191, b"GONE", -1, missing))
+    assert (client.ask(["A", "GONE"]), client.absent) == (["A"], {"GONE"})
+    busy = dialect.MAV_PARAM_ERROR_READ_ONLY
+    far.hear(dialect.MAVLink_param_error_message(254, 191, b"A", -1, busy))
+    assert client.absent == {"GONE"}
+
+
+def test_px4_that_is_silent_about_a_parameter_lacks_it_once_it_answers_others() -> None:
+    client = ParameterClient(lambda _: None)
+    client.address(1, 1, PX4_ID)
+    for _ in range(2 * SILENT_REQUESTS):
+        assert client.ask(["A", "GONE"]) == ["A", "GONE"]  # nothing is answered yet
+    client.take(value_message("A", struct.pack("<f", 1.0), 9))
+    for _ in range(SILENT_REQUESTS):
+        assert client.ask(["A", "GONE"]) == ["GONE"]
+    assert client.ask(["A", "GONE"]) == []
+    assert client.absent == {"GONE"}
+
+
+def test_the_version_is_asked_for_until_it_came() -> None:
+    far = Far()
+    far.hear(heartbeat(PX4_ID, 0, 0))
+    requests = []
+    for now_s in (2, 4):
+        far.observer.send(now_s * 1_000_000)
+        sent = dialect.MAVLink(None).parse_buffer(b"".join(far.endpoint.take())) or []
+        requests.append([m.param1 for m in sent if m.get_type() == "COMMAND_LONG"].count(148.0))
+        version = [0, 0x01110180, 0, 0, 0, b"\0" * 8, b"\0" * 8, b"\0" * 8, 0, 0, 0]
+        far.hear(dialect.MAVLink_autopilot_version_message(*version))
+    assert requests == [1, 0]
+    assert far.observer.version == 0x01110180
+
+
 def test_values_agree_to_the_precision_of_the_wire() -> None:
     assert same(struct.unpack("<f", struct.pack("<f", 0.52))[0], 0.52)
     assert not same(0.521, 0.52)
@@ -358,7 +401,8 @@ def test_it_asks_for_what_does_not_come() -> None:
     beats = [m for m in asked if m.get_type() == "HEARTBEAT"]
     assert [beat.type for beat in beats] == [dialect.MAV_TYPE_GCS]
     asked = [m for m in asked if m not in beats]
-    assert {m.command for m in asked} == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL}
+    request = dialect.MAV_CMD_REQUEST_MESSAGE
+    assert {m.command for m in asked} == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL, request}
     assert dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE in {int(m.param1) for m in asked}
 
 

@@ -24,16 +24,15 @@ from airl_mav.addons.conformance.checklist import (
     Transcript,
     TranscriptLine,
     require,
-    version_name,
 )
 from airl_mav.addons.conformance.command import ConformanceOptions, run
 from airl_mav.addons.conformance.result import (
     ConformanceResult,
     ConformanceSettings,
+    Reference,
     StoredStep,
     Tolerance,
     deviations,
-    load_reference,
 )
 from airl_mav.addons.conformance.telemetry import (
     BEFORE_S,
@@ -51,7 +50,13 @@ from airl_mav.addons.conformance.telemetry import (
 from airl_mav.addons.conformance.vehicle import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.loading import list_profiles
+from airl_mav.core.fields import validated
+from airl_mav.profiles.loading import (
+    list_profiles,
+    load_profile,
+    stored_release,
+    version_name,
+)
 from companion.link_interface import LinkError
 
 RATE_HZ = 1000.0
@@ -237,20 +242,34 @@ def test_named_steps_alone_are_measured() -> None:
 
 @pytest.mark.parametrize("name", list_profiles("conformance"))
 def test_shipped_columns_are_whole(name: str) -> None:
-    reference = load_reference(name, 0)
+    reference = load_profile("conformance", name, Reference)
     assert set(reference.steps) == set(STEP_NAMES)
     for stored in reference.steps.values():
         assert None not in (stored.latency_s, stored.rise_s, stored.overshoot_percent)
 
 
-@pytest.mark.parametrize(("autopilot", "name"), [(12, "px4"), (3, "ardupilot")])
-def test_a_column_is_found_by_the_autopilot(autopilot: int, name: str) -> None:
-    assert load_reference("auto", autopilot) == load_reference(name, 0)
+@pytest.mark.parametrize(
+    ("firmware", "version", "column", "title"),
+    [
+        ("PX4", 0x01100040, "px4-1.16", "PX4 1.16.0 alpha"),
+        ("PX4", 0x011002FF, "px4-1.16", "PX4 1.16.2"),
+        ("PX4", 0x010E03FF, "px4-1.16", "PX4 1.14.3: no column; compared with 1.16"),
+        ("ArduPilot", 0x04070000, "ardupilot-4.7", "ArduPilot 4.7.0 dev"),
+        ("ArduPilot", 0x040503FF, "ardupilot-4.7", "ArduPilot 4.5.3: no column; compared with 4.7"),
+        ("Betaflight", 0x040503FF, "", "Betaflight 4.5.3"),
+    ],
+)
+def test_a_column_is_found_by_the_release(
+    firmware: str, version: int, column: str, title: str
+) -> None:
+    assert stored_release(firmware, version) == (column, title)
 
 
-def test_no_column_for_an_unknown_autopilot() -> None:
-    with pytest.raises(UsageError, match=r"autopilot 8; accepted: .*px4"):
-        load_reference("auto", 8)
+def test_the_nearest_release_is_the_newest_for_one_to_come() -> None:
+    newest = max(int(each[6:]) for each in list_profiles("conformance") if each[:6] == "px4-1.")
+    column, title = stored_release("PX4", 1 << 24 | (newest + 1) << 16 | 0xFF)
+    assert column == f"px4-1.{newest}"
+    assert title == f"PX4 1.{newest + 1}.0: no column; compared with 1.{newest}"
 
 
 STORED = StoredStep(latency_s=0.1, rise_s=1.0, overshoot_percent=3.0)
@@ -366,7 +385,10 @@ def test_a_failed_essential_check_ends_its_table_and_steps_alone_need_fewer() ->
     ("found", "verdict"),
     [
         ({}, "FAILED: 1 passed, 1 failed, 0 not applicable: land"),
-        ({"interrupted": True}, "INTERRUPTED: 1 passed, 1 failed, 0 not applicable"),
+        (
+            {"interrupted": True, "firmware": "PX4 1.17.0"},
+            "INTERRUPTED: 1 passed, 1 failed, 0 not applicable; PX4 1.17.0",
+        ),
         (
             {"known_to_be_down": False},
             "FAILED: 1 passed, 1 failed, 0 not applicable: land; NOT known to be down",
@@ -376,7 +398,7 @@ def test_a_failed_essential_check_ends_its_table_and_steps_alone_need_fewer() ->
 def test_verdict(found: dict[str, Any], verdict: str) -> None:
     checklist, _ = a_checklist()
     checklist.perform("arm", lambda: "armed")
-    checklist.skip("land", "not reached")
+    checklist.perform("land", lambda: str(require(False, "not reached")))
     result = a_result(checklist, **found)
     assert result.verdict == verdict
     assert not result.passed
@@ -407,7 +429,7 @@ def test_versions(number: int, name: str) -> None:
 
 def test_columns_say_where_they_come_from() -> None:
     for path in (Path(__file__).parents[2] / "profiles" / "conformance").glob("*.toml"):
-        assert len(load_reference(str(path), 0).source) > 40
+        assert len(load_profile("conformance", str(path), Reference).source) > 40
 
 
 # --- the command
@@ -424,7 +446,7 @@ def test_columns_say_where_they_come_from() -> None:
         ({"altitude_m": 1.0, "steps_only": True}, "altitude_m 1: accepted: 2 <= value <= 100"),
         ({"repeat": 0}, "repeat 0: accepted: 1 <= value <= 20"),
         ({"connect_timeout_s": 0.0}, "connect_timeout_s 0: accepted: 1 <= value <= 3600"),
-        ({"reference": "betaflight"}, "'betaflight'; shipped: ardupilot, ardupilot-own-model, px4"),
+        ({"reference": "betaflight"}, "'betaflight'; shipped: ardupilot-4.7, "),
         ({"out": Path("no/such/folder/x.json")}, "out 'no/such/folder/x.json': no folder"),
         ({"skip_steps": True, "steps_only": True}, "skip_steps: accepted: without --steps-only"),
         ({"skip_steps": True, "steps": ("yaw-90",)}, "skip_steps: accepted: without --steps"),
@@ -432,7 +454,7 @@ def test_columns_say_where_they_come_from() -> None:
 )
 def test_input_that_cannot_be_used(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        run(ConformanceOptions(**options), Console(file=io.StringIO()))
+        run(validated(ConformanceOptions, options), Console(file=io.StringIO()))
     assert message in str(error.value)
 
 

@@ -72,7 +72,7 @@ def patient_reference(folder: Path) -> Path:
     is 30 ms of simulated time. tests/flight/test_step_response.py checks the latencies to 10 % in
     simulated time.
     """
-    column = (profiles_dir() / "conformance" / "px4.toml").read_text(encoding="utf-8")
+    column = (profiles_dir() / "conformance" / "px4-1.16.toml").read_text(encoding="utf-8")
     path = folder / "px4.toml"
     assert "floor_s = 0.015" in column
     path.write_text(column.replace("floor_s = 0.015", "floor_s = 0.200"), encoding="utf-8")
@@ -100,7 +100,9 @@ def test_the_built_in_firmware_conforms_to_px4(steps: tuple[str, ...], tmp_path:
         status = command.wait()
         text = command.text()
     assert status == 0, text
-    assert re.search(r"^CONFORMS to PX4: \d+ passed, 0 failed, 0 not applicable$", text, re.M)
+    assert re.search(
+        r"^CONFORMS to PX4 1\.16: \d+ passed, 0 failed, 0 not applicable; PX4 1\.16", text, re.M
+    )
     checks = checks_of(out)
     assert {check["outcome"] for check in checks.values()} == {"pass"}
     assert {f"step {name}" for name in steps} < set(checks)
@@ -137,7 +139,9 @@ def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
         status = command.wait()
         text = command.text()
     assert status == 1, text
-    assert re.search(r"^FAILED: \d+ passed, 1 failed, .*: step north-2$", text, re.M), text
+    assert re.search(r"^FAILED: \d+ passed, 1 failed, .*: step north-2; PX4 1\.16", text, re.M), (
+        text
+    )
     checks = checks_of(out)
     assert checks["step north-2"]["outcome"] == "fail"
     assert "rise" in checks["step north-2"]["finding"]

@@ -16,15 +16,12 @@ from companion.link_interface import LinkError
 class MavCommand(IntEnum):
     """MAV_CMD."""
 
-    NAV_WAYPOINT = 16
-    NAV_RETURN_TO_LAUNCH = 20
     NAV_LAND = 21
     NAV_TAKEOFF = 22
     DO_SET_MODE = 176
     COMPONENT_ARM_DISARM = 400
     SET_MESSAGE_INTERVAL = 511
     REQUEST_MESSAGE = 512
-    REQUEST_AUTOPILOT_CAPABILITIES = 520
 
 
 MavResult = IntEnum(
@@ -46,10 +43,6 @@ class MavFrame(IntEnum):
 
 
 UNKNOWN_COMMAND = 29_999  # Undefined in all dialects
-VEHICLE_TYPES = {
-    2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"
-}  # fmt: skip
-
 ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 CUSTOM_MODE_FLAG = 1  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK: the vehicle may be armed
@@ -68,13 +61,6 @@ def name_of(kind: type[IntEnum], number: int) -> str:
         return kind(number).name
     except ValueError:
         return str(number)
-
-
-def version_name(flight_sw_version: int) -> str:
-    """Return AUTOPILOT_VERSION.flight_sw_version as 1.16.0 alpha; its last byte is the stage."""
-    major, minor, patch, stage = flight_sw_version.to_bytes(4, "big")
-    stages = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
-    return f"{major}.{minor}.{patch}" + next(name for least, name in stages if stage >= least)
 
 
 LineKind = Literal["sent", "heard", "check", "note"]
@@ -200,10 +186,6 @@ class Checklist:
             for entry in table
             if entry.for_steps or not steps_only
         )
-
-    def skip(self, name: str, reason: str) -> None:
-        """Record a check that could not be made as failed."""
-        self._note(name, CheckOutcome.FAILED, reason, self._transcript.time_s)
 
     def _note(self, name: str, outcome: CheckOutcome, finding: str, start_s: float) -> None:
         self.checks.append(

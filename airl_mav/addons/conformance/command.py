@@ -19,20 +19,22 @@ from airl_mav.addons.conformance.checklist import (
     TranscriptLine,
     require,
 )
-from airl_mav.addons.conformance.ground_checks import GROUND_CHECKS, heartbeat
+from airl_mav.addons.conformance.ground_checks import GROUND_CHECKS, heartbeat, version
 from airl_mav.addons.conformance.result import (
+    AUTO,
     ConformanceResult,
     ConformanceSettings,
+    Reference,
     check_table,
     judge,
     line_text,
-    load_reference,
     step_table,
     summary,
 )
 from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
 from airl_mav.core import child_process, clock, constants, errors, fields
 from airl_mav.core.progress import new_console
+from airl_mav.profiles import loading
 from companion.link_interface import LinkError
 
 
@@ -135,8 +137,13 @@ def _check(vehicle: VehicleConnection, checklist: Checklist, result: Conformance
     settings = result.settings
     if not checklist.perform("heartbeat", lambda: heartbeat(vehicle)):
         return
-    beat = vehicle.telemetry.latest("HEARTBEAT") or {}
-    result.reference = load_reference(settings.reference, beat["autopilot"])
+    checklist.perform("version", lambda: version(vehicle))
+    fields = vehicle.telemetry.latest("AUTOPILOT_VERSION") or {"flight_sw_version": 0}
+    title, number = vehicle.autopilot.title, fields["flight_sw_version"]
+    column, result.firmware = loading.stored_release(title, number)
+    vehicle.transcript.add("note", result.firmware)
+    column = column if settings.reference == AUTO else settings.reference
+    result.reference = loading.load_profile("conformance", column, Reference)
     vehicle.unasked_hz = result.reference.streams_hz
     try:
         if checklist.perform_all(GROUND_CHECKS, vehicle, steps_only=settings.steps_only):
@@ -163,7 +170,7 @@ def _check_in_air(
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
     if not settings.steps_only:
         if not checklist.perform_all(flight_checks.LOSS_CHECKS, vehicle):
-            checklist.skip("setpoints resume", "not reached")
+            checklist.perform("setpoints resume", partial(require, 0, "not reached"))
         checklist.perform("hold", lambda: flight_checks.hold(vehicle))
     checklist.perform_all(flight_checks.LANDING_CHECKS, vehicle)
 
@@ -174,22 +181,21 @@ def _fly_steps(
     measured: dict[telemetry.StepName, telemetry.MeasuredStep],
 ) -> str:
     """Fly the steps and add their responses. Raises CheckFailedError, LinkError."""
-    steps = {leg.step.name: leg.step for legs in telemetry.MANOEUVRES for leg in legs if leg.step}
+    named = {leg.step.name: leg.step for legs in telemetry.MANOEUVRES for leg in legs if leg.step}
     flight_checks.start_offboard(vehicle, telemetry.STOP_NED)
     vehicle.wait(FACE_NORTH_S)
-    inexact = vehicle.clock.inexact
     for repetition in range(settings.repeat):
         for leg in telemetry.plan(settings.flown_steps, mirrored=repetition % 2 == 1):
             response = _fly_leg(vehicle, leg)
             if leg.step is not None and response is not None:
                 name = leg.step.name
                 vehicle.transcript.add("note", f"{name}: {summary(response)}")
-                measured.setdefault(name, telemetry.MeasuredStep(steps[name], [])).flights.append(
+                measured.setdefault(name, telemetry.MeasuredStep(named[name], [])).flights.append(
                     response
                 )
-    inexact = vehicle.clock.inexact - inexact
-    finding = f"{sum(len(each.flights) for each in measured.values())} steps"
-    finding += f", timed by {vehicle.clock.method.value}"
+    steps = sum(len(each.flights) for each in measured.values())
+    finding = f"{steps} steps, timed by {vehicle.clock.method.value}"
+    inexact = vehicle.clock.inexact
     return finding + (f", {inexact} setpoints only by the newest telemetry" if inexact else "")
 
 

@@ -10,6 +10,7 @@ from airl_mav.addons.conformance.telemetry import Fields
 from airl_mav.addons.conformance.vehicle import Method, VehicleConnection
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.loading import version_name
 
 FIRST_MESSAGE_S = 5.0  # Timeout of a message that every vehicle sends [wall s]
 COUNT_S = 5.0  # Duration of message counting [s]
@@ -38,9 +39,7 @@ def heartbeat(vehicle: VehicleConnection) -> str:
     """Wait for a heartbeat, and expect its autopilot's behaviour in later checks."""
     beat = _first(vehicle, "HEARTBEAT")
     vehicle.expect_autopilot(beat["autopilot"])
-    kind = checklist.VEHICLE_TYPES.get(beat["type"], "vehicle")
-    title = vehicle.autopilot.title
-    who = f"{title} (autopilot {beat['autopilot']}), {kind} (type {beat['type']})"
+    who = f"{vehicle.autopilot.title}, MAV_TYPE {beat['type']}"
     checklist.require(not vehicle.armed, f"{who}: it is armed already: disarm it first")
     return f"{who}, {vehicle.mode_name}, disarmed"
 
@@ -58,7 +57,8 @@ def require_answer(
     return f'{name}, "{heard.text}"'
 
 
-def _version(vehicle: VehicleConnection) -> str:
+def version(vehicle: VehicleConnection) -> str:
+    """Request AUTOPILOT_VERSION; expect the needed capabilities."""
     # MAVSDK requests it when it connects.
     if vehicle.telemetry.latest("AUTOPILOT_VERSION") is None:
         vehicle.command(
@@ -66,8 +66,8 @@ def _version(vehicle: VehicleConnection) -> str:
         )
     fields = _first(vehicle, "AUTOPILOT_VERSION")
     capabilities = fields["capabilities"]
-    version = checklist.version_name(fields["flight_sw_version"])
-    finding = f"version {version}, capabilities {capabilities:#x}"
+    name = version_name(fields["flight_sw_version"])
+    finding = f"version {name}, capabilities {capabilities:#x}"
     missing = [name for bit, name in NEEDED_CAPABILITIES.items() if not capabilities & bit]
     checklist.require(not missing, f"{finding}: without {', '.join(missing)}")
     return finding
@@ -209,7 +209,6 @@ def _require_rates(
 
 
 GROUND_CHECKS = (
-    checklist.CheckDefinition("version", _version, for_steps=True),
     checklist.CheckDefinition("clock", _clock, for_steps=True),
     checklist.CheckDefinition("streams unasked", _unasked_streams),
     checklist.CheckDefinition("streams asked for", _ask_streams, essential=True, for_steps=True),

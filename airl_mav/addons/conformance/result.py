@@ -17,10 +17,10 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, usage_errors
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import write_json
-from airl_mav.profiles.loading import list_profiles, load_profile
+from airl_mav.profiles.loading import load_profile
 
 AUTO = "auto"
-"""Selects the stored column of the vehicle's autopilot, the first by name of several."""
+"""Selects the stored column of the firmware's release, or of the nearest one."""
 
 JUDGED = ("latency_s", "rise_s", "overshoot_percent")
 """Figures with a tolerance; the others follow from these, or are noise."""
@@ -54,7 +54,6 @@ class Reference(ProfileModel):
 
     title: str = Field(description="name of the firmware")
     source: str = Field(description="where the figures come from")
-    autopilot: int = Field(description="HEARTBEAT.autopilot, a MAV_AUTOPILOT")
     tolerance: Tolerance = Field(default_factory=Tolerance, description="tolerances")
     streams_hz: Mapping[str, float] = Field(
         description="messages that a fresh UDP link carries unasked [Hz]"
@@ -125,20 +124,6 @@ def judge(measured: telemetry.MeasuredStep | None, reference: Reference) -> str:
     return summary(measured.median)
 
 
-def load_reference(name: str, autopilot: int) -> Reference:
-    """Return stored steps: `auto` (by HEARTBEAT.autopilot), a name or path. Raises UsageError."""
-    if name != AUTO:
-        return load_profile("conformance", name, Reference)
-    for shipped in list_profiles("conformance"):
-        reference = load_profile("conformance", shipped, Reference)
-        if reference.autopilot == autopilot:
-            return reference
-    known = ", ".join(list_profiles("conformance"))
-    accepted = f"{known}, or a path to a .toml"
-    problem = f"nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: {accepted}"
-    raise FieldError("reference", AUTO, problem=problem)
-
-
 SCHEMA = 1
 
 
@@ -152,11 +137,13 @@ class ConformanceSettings(BaseModel):
     )
     reference: str = Field(
         default=AUTO,
-        description="stored step responses to compare with: auto (by the autopilot that is heard),"
-        " px4, ardupilot, or a path to a .toml",
+        description="stored step responses to compare with: auto (by the firmware's release), a"
+        " name such as px4-1.17, or a path to a .toml",
     )
     speed: float = Field(
         default=1.0,
+        ge=0.01,
+        le=100.0,
         description="simulated seconds per wall second of the vehicle; 1 for a real one",
     )
     altitude_m: float = Field(
@@ -166,6 +153,8 @@ class ConformanceSettings(BaseModel):
     )
     repeat: int = Field(
         default=1,
+        ge=1,
+        le=20,
         description="how often the steps are flown, 1 to 20: the table has the median; every other"
         " time they are mirrored, so that the vehicle comes back",
     )
@@ -179,6 +168,8 @@ class ConformanceSettings(BaseModel):
     )
     connect_timeout_s: float = Field(
         default=30.0,
+        ge=1.0,
+        le=3600.0,
         description="how long a flight controller is waited for, 1 to 3600 s of wall time",
     )
 
@@ -188,20 +179,15 @@ class ConformanceSettings(BaseModel):
         return telemetry.STEP_NAMES if self.steps is None else self.steps
 
     def check(self) -> None:
-        """Raise UsageError if a value is out of range."""
-        for name, low, high in (
-            ("speed", 0.01, 100.0),
-            ("altitude_m", 2.0 if self.steps_only else 8.0, 100.0),
-            ("repeat", 1, 20),
-            ("connect_timeout_s", 1.0, 3600.0),
-        ):
-            if not low <= (value := getattr(self, name)) <= high:
-                raise FieldError(name, value, f"{low:g} <= value <= {high:g}")
+        """Raise UsageError if a value does not fit the others."""
+        lowest_m = 2 if self.steps_only else 8
+        if not lowest_m <= self.altitude_m <= 100.0:
+            raise FieldError("altitude_m", self.altitude_m, f"{lowest_m} <= value <= 100")
         for step in self.flown_steps:
             if step not in telemetry.STEP_NAMES:
                 raise FieldError("steps", step, ", ".join(telemetry.STEP_NAMES))
         if self.reference != AUTO:
-            load_reference(self.reference, 0)
+            load_profile("conformance", self.reference, Reference)
 
 
 @dataclass
@@ -217,6 +203,8 @@ class ConformanceResult:
     """Stored column; None before the autopilot is known."""
     heartbeat: telemetry.Fields | None = None
     autopilot_version: telemetry.Fields | None = None
+    firmware: str = ""
+    """Name and version of the firmware; empty before they are known."""
     interrupted: bool = False
     known_to_be_down: bool = True
     """True if the vehicle is known to be disarmed at the end."""
@@ -236,12 +224,13 @@ class ConformanceResult:
         passed = sum(check.outcome is checklist.CheckOutcome.PASSED for check in self.checks)
         rest = len(self.checks) - passed - len(failed)
         counted = f"{passed} passed, {len(failed)} failed, {rest} not applicable"
-        down = "" if self.known_to_be_down else "; NOT known to be down"
+        end = f"; {self.firmware}" if self.firmware else ""
+        end += "" if self.known_to_be_down else "; NOT known to be down"
         if self.interrupted:
-            return f"INTERRUPTED: {counted}{down}"
+            return f"INTERRUPTED: {counted}{end}"
         if failed:
-            return f"FAILED: {counted}: {', '.join(failed)}{down}"
-        return f"CONFORMS to {self.reference.title if self.reference else ''}: {counted}"
+            return f"FAILED: {counted}: {', '.join(failed)}{end}"
+        return f"CONFORMS to {self.reference.title if self.reference else ''}: {counted}{end}"
 
     def as_data(self) -> dict[str, Any]:
         """Return all results in the file format of docs/reference/conformance.md."""
@@ -257,6 +246,7 @@ class ConformanceResult:
                 "repeat": settings.repeat,
                 "behaviour": not settings.steps_only,
             },
+            "firmware": self.firmware,
             "vehicle": {"heartbeat": self.heartbeat, "autopilot_version": self.autopilot_version},
             "reference": self.reference and self.reference.model_dump(),
             "verdict": self.verdict,
