@@ -84,7 +84,8 @@ class Truth:
 
 
 ESTIMATED = (dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, dialect.MAVLINK_MSG_ID_ATTITUDE)
-INTERVAL_US = 10_000
+RATE_HZ = 100.0
+"""Rate of LOCAL_POSITION_NED; PX4 sends ATTITUDE as often unasked."""
 
 
 class Telemetry(VehicleEnd):
@@ -94,18 +95,8 @@ class Telemetry(VehicleEnd):
         self._end = end
         self.answers_later = end.answers_later
         self.deliver, self.settle = end.deliver, end.settle
-        self._mav = dialect.MAVLink(None, srcSystem=245, srcComponent=190)
+        self._mav = dialect.MAVLink(None)
         self._rows: dict[int, list[tuple[float, ...]]] = {number: [] for number in ESTIMATED}
-        self._system = 1
-
-    def ask(self) -> None:
-        """Request the messages."""
-        for number in ESTIMATED:
-            message = dialect.MAVLink_command_long_message(
-                *(self._system, 1, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0),
-                *(number, INTERVAL_US, 0, 0, 0, 0, 0),
-            )
-            self._end.deliver(message.pack(self._mav), lambda: None, echo=False)
 
     def take(self) -> list[bytes]:
         """Return the received frames."""
@@ -121,13 +112,13 @@ class Telemetry(VehicleEnd):
 
     def _read(self, frames: list[bytes]) -> list[bytes]:
         for frame in frames:
-            self._system = frame[5]
             number = int.from_bytes(frame[7:10], "little")
             if number in ESTIMATED and frame[6] == telemetry.AUTOPILOT_COMPONENT:
-                (m,) = self._mav.parse_buffer(frame)
-                row = (m.yaw, m.yawspeed)
+                m = self._mav.decode(bytearray(frame))
+                names = ("yaw", "yawspeed")
                 if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
-                    row = (m.x, m.y, m.z, m.vx, m.vy, m.vz)
+                    names = ("x", "y", "z", "vx", "vy", "vz")
+                row = (getattr(m, name) for name in names)
                 self._rows[number].append((m.time_boot_ms / 1e3, *row))
         return frames
 
@@ -163,7 +154,8 @@ def flown_steps(
             link.takeoff(ALTITUDE_M, 60.0, stop)
             link.enter_offboard()
             if estimated:
-                heard.ask()
+                plugin: Any = stage.link._telemetry
+                plugin.set_rate_position_velocity_ned(RATE_HZ)
             hold(telemetry.HeldSetpoint(telemetry.STOP_NED, SETTLE_S))
             for leg in telemetry.plan(telemetry.STEP_NAMES, mirrored=seed % 2 == 0):
                 hold(leg)

@@ -273,7 +273,7 @@ def conformance(command: Command, firmware: Firmware) -> dict[str, Any]:
     """Return the result of airl conformance."""
     folder, speed = command.out / firmware.name, speed_of(command)
     found = folder / "conformance.partial.json"
-    argv = ["-m", "airl_mav.cli.main", "conformance", "--speed", f"{speed:g}", "--repeat", "2"]
+    argv = ["-m", "airl_mav.cli.main", "conformance", "--speed", f"{speed:g}"]
     with flying(command, firmware, speed) as vehicle:
         argv += ["--connect", f"udpin://127.0.0.1:{vehicle.port}", "--out", str(found)]
         run(argv, folder / "conformance.log", accepted=(0, 1))

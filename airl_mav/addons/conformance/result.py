@@ -26,6 +26,18 @@ JUDGED = ("latency_s", "rise_s", "overshoot_percent")
 """Figures with a tolerance; the others follow from these, or are noise."""
 
 
+FIGURES: dict[str, tuple[str, float, int]] = {
+    "latency_s": ("latency\nms", 1e3, 0),
+    "t10_s": ("t10\nms", 1e3, 0),
+    "t50_s": ("t50\nms", 1e3, 0),
+    "rise_s": ("rise\nms", 1e3, 0),
+    "overshoot_percent": ("overshoot\n%", 1.0, 1),
+    "error": ("error\nat end", 1.0, 2),
+    "settle_s": ("settle 5 %\ns", 1.0, 2),
+}
+"""Column heading, scale and digits of each figure of a StepResponse."""
+
+
 class Tolerance(ProfileModel):
     """Maximum deviation of a figure from the stored one."""
 
@@ -71,14 +83,9 @@ class Deviation(NamedTuple):
     """Maximum allowed difference, in the figure's unit."""
 
     def __str__(self) -> str:
-        name, _, unit = self.figure.rpartition("_")
-        sign, points, scale, digits = ("ms", "ms", 1e3, 0)
-        if unit == "percent":
-            sign, points, scale, digits = ("%", "points", 1.0, 1)
-        return (
-            f"{name} {scale * self.measured:.{digits}f} {sign}, stored "
-            f"{scale * self.stored:.{digits}f} +- {scale * self.allowed:.{digits}f} {points}"
-        )
+        heading, scale, digits = FIGURES[self.figure]
+        found, stored, allowed = (f"{scale * value:.{digits}f}" for value in self[1:])
+        return f"{heading} {found}, stored {stored} +- {allowed}".replace("\n", " in ")
 
 
 def deviations(
@@ -212,16 +219,12 @@ class ConformanceResult:
     @property
     def passed(self) -> bool:
         """True if checks were made and all passed."""
-        failed = any(check.outcome is checklist.CheckOutcome.FAILED for check in self.checks)
-        return bool(self.checks) and not failed and not self.interrupted
+        return bool(self.checks) and not self._named("fail") and not self.interrupted
 
     @property
     def verdict(self) -> str:
         """Outcome in one line."""
-        failed = [
-            check.name for check in self.checks if check.outcome is checklist.CheckOutcome.FAILED
-        ]
-        passed = sum(check.outcome is checklist.CheckOutcome.PASSED for check in self.checks)
+        failed, passed = self._named("fail"), len(self._named("pass"))
         rest = len(self.checks) - passed - len(failed)
         counted = f"{passed} passed, {len(failed)} failed, {rest} not applicable"
         end = f"; {self.firmware}" if self.firmware else ""
@@ -232,20 +235,15 @@ class ConformanceResult:
             return f"FAILED: {counted}: {', '.join(failed)}{end}"
         return f"CONFORMS to {self.reference.title if self.reference else ''}: {counted}{end}"
 
+    def _named(self, outcome: str) -> list[str]:
+        return [check.name for check in self.checks if check.outcome.value == outcome]
+
     def as_data(self) -> dict[str, Any]:
         """Return all results in the file format of docs/reference/conformance.md."""
-        settings = self.settings
         return {
             "schema": SCHEMA,
             "date_utc": utc_now().isoformat(timespec="seconds"),
-            "connection": settings.connect,
-            "speed": settings.speed,
-            "asked": {
-                "altitude_m": settings.altitude_m,
-                "steps": settings.flown_steps,
-                "repeat": settings.repeat,
-                "behaviour": not settings.steps_only,
-            },
+            "settings": self.settings.model_dump(),
             "firmware": self.firmware,
             "vehicle": {"heartbeat": self.heartbeat, "autopilot_version": self.autopilot_version},
             "reference": self.reference and self.reference.model_dump(),
@@ -280,17 +278,6 @@ def _without_nan(response: telemetry.StepResponse) -> dict[str, float | None]:
         name: None if math.isnan(value) else value for name, value in response._asdict().items()
     }
 
-
-FIGURES: dict[str, tuple[str, float, int]] = {
-    "latency_s": ("latency\nms", 1e3, 0),
-    "t10_s": ("t10\nms", 1e3, 0),
-    "t50_s": ("t50\nms", 1e3, 0),
-    "rise_s": ("rise\nms", 1e3, 0),
-    "overshoot_percent": ("overshoot\n%", 1.0, 1),
-    "error": ("error\nat end", 1.0, 2),
-    "settle_s": ("settle 5 %\ns", 1.0, 2),
-}
-"""Column heading, scale and digits of each figure of a StepResponse."""
 
 LINE_MARKS = {"sent": ("->", "cyan"), "heard": ("<-", ""), "check": ("==", "bold")}
 COLOURS = {
