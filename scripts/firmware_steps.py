@@ -1,11 +1,10 @@
 """Step responses of a flight controller in lockstep, by the true state at every tick.
 
-    python scripts/firmware_steps.py [--px4-dir DIR] [--estimated] [--seeds 3] [--json FILE]
+    python scripts/firmware_steps.py [--px4-dir DIR] [--px4-release 1.17] [--seeds 3] [--json FILE]
 
 Flies the steps of `airl conformance` with a real PX4, or with the built-in flight controller, on
-the same simulated vehicle. A step's time counts from the companion's call of MAVSDK. With
---estimated, the figures are those of LOCAL_POSITION_NED and ATTITUDE at 100 Hz, as in the stored
-columns.
+the same simulated vehicle. A step's time counts from the companion's call of MAVSDK. The stored
+columns have the figures of --estimated: of LOCAL_POSITION_NED and ATTITUDE at 100 Hz.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import new_console
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.vehicle import VehicleEnd, builtin_vehicle, real_vehicle
+from airl_mav.profiles.px4_release import PX4ReleaseName
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.rotation import yaw_of
@@ -53,11 +54,14 @@ class Command:
     instance: int = 0
     """First instance that is tried."""
 
-    estimated: bool = False
-    """Measure by the vehicle's telemetry."""
+    px4_release: PX4ReleaseName | None = None
+    """Release of the built-in flight controller."""
 
     json: Path | None = None
     """File for the figures."""
+
+    estimated: Path | None = None
+    """File for the figures by the vehicle's telemetry."""
 
 
 class Truth:
@@ -123,11 +127,12 @@ class Telemetry(VehicleEnd):
         return frames
 
 
-def flown_steps(
-    aircraft: Aircraft, seed: int, *, estimated: bool = False
-) -> dict[str, telemetry.StepResponse]:
-    """Return the responses of one flight, by step."""
-    vehicle = load_vehicle(aircraft.vehicle)
+Steps = dict[str, telemetry.StepResponse]
+
+
+def flown_steps(aircraft: Aircraft, seed: int) -> tuple[Steps, Steps]:
+    """Return the responses of one flight, by step: the true ones, and those of telemetry."""
+    vehicle = load_vehicle(aircraft.vehicle, aircraft.px4_release)
     conducted = real_vehicle(aircraft, vehicle) or builtin_vehicle(SimClock())
     heard = Telemetry(conducted.end)
     conducted = replace(conducted, end=heard)
@@ -153,9 +158,8 @@ def flown_steps(
             link.arm(60.0, stop)
             link.takeoff(ALTITUDE_M, 60.0, stop)
             link.enter_offboard()
-            if estimated:
-                plugin: Any = stage.link._telemetry
-                plugin.set_rate_position_velocity_ned(RATE_HZ)
+            plugin: Any = stage.link._telemetry
+            plugin.set_rate_position_velocity_ned(RATE_HZ)
             hold(telemetry.HeldSetpoint(telemetry.STOP_NED, SETTLE_S))
             for leg in telemetry.plan(telemetry.STEP_NAMES, mirrored=seed % 2 == 0):
                 hold(leg)
@@ -164,7 +168,13 @@ def flown_steps(
 
         stage.firmware.on_ticks = truth.add
         stage.run(EpisodeSetup(vehicle, None, seed, aircraft=aircraft), program)
-    motion, responses = heard.motion() if estimated else truth.motion(), {}
+    return _measured(truth.motion(), sent), _measured(heard.motion(), sent)
+
+
+def _measured(
+    motion: telemetry.EstimatedMotion, sent: list[tuple[telemetry.HeldSetpoint, float]]
+) -> Steps:
+    responses = {}
     for leg, sent_s in sent:
         if leg.step is not None:
             part = motion.between(sent_s - telemetry.BEFORE_S, sent_s + leg.seconds)
@@ -172,11 +182,8 @@ def flown_steps(
     return responses
 
 
-def mean_steps(
-    aircraft: Aircraft, seeds: int, *, estimated: bool = False
-) -> dict[str, telemetry.StepResponse]:
+def mean_steps(flights: Sequence[Steps]) -> Steps:
     """Return the mean responses of several flights, by step."""
-    flights = [flown_steps(aircraft, seed, estimated=estimated) for seed in range(1, seeds + 1)]
     return {
         name: telemetry.StepResponse(*np.mean([each[name] for each in flights], axis=0).tolist())
         for name in flights[0]
@@ -189,9 +196,11 @@ def main(command: Command) -> int:
     aircraft = Aircraft(
         vehicle=command.vehicle,
         real={"px4_dir": command.px4_dir, "instance": command.instance},
+        px4_release=command.px4_release,
         **firmware,
     )
-    found = mean_steps(aircraft, command.seeds, estimated=command.estimated)
+    flights = [flown_steps(aircraft, seed) for seed in range(1, command.seeds + 1)]
+    found, estimated = (mean_steps(each) for each in zip(*flights, strict=True))
     console = new_console(soft_wrap=True)
     for name, step in found.items():
         console.print(
@@ -200,9 +209,10 @@ def main(command: Command) -> int:
             f"{step.overshoot_percent:5.1f} %  error {step.error:5.2f}  "
             f"settle {step.settle_s:4.2f} s"
         )
-    if command.json is not None:
-        plain = {name: step._asdict() for name, step in found.items()}
-        command.json.write_text(json.dumps(plain, indent=1) + "\n")
+    for path, steps in ((command.json, found), (command.estimated, estimated)):
+        if path is not None:
+            plain = {name: step._asdict() for name, step in steps.items()}
+            path.write_text(json.dumps(plain, indent=1) + "\n")
     return 0
 
 

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import tyro
 from pymavlink import mavutil
@@ -29,11 +29,15 @@ from pymavlink.dialects.v20 import common as dialect
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from airl_mav.addons.conformance.result import Reference, deviations
+from airl_mav.addons.conformance.telemetry import StepResponse
 from airl_mav.core.child_process import ChildProcess, terminated_as_interrupted
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from airl_mav.flight.statistics import Estimate, compare_pairs
+from airl_mav.profiles.loading import load_profile, stored_release, version_name
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft, RealFirmware
+from airl_mav.scenario.aircraft import GREATEST_INSTANCE, RealFirmware
 from firmware_sim.external.programs import check_free, firmware_kind
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -244,36 +248,34 @@ def version_of(number: int, custom: bytes) -> dict[str, Any]:
 
     PX4 sends the first 8 bytes of its git hash as an integer, ArduPilot 8 letters.
     """
-    major, minor, patch, stage = number.to_bytes(4, "big")
-    stages = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
     text = custom.rstrip(b"\0").decode(errors="replace")
     letters = bool(text) and all(letter in "0123456789abcdef" for letter in text)
     return {
-        "version": f"{major}.{minor}.{patch}"
-        + next(name for least, name in stages if stage >= least),
-        "release": f"{major}.{minor}",
+        "version": version_name(number),
+        "number": number,
         "git": text if letters else custom[::-1].hex()[:10],
     }
 
 
 def steps(command: Command, firmware: Firmware) -> dict[str, Any]:
-    """Return step responses in lockstep, by the true state."""
+    """Return step responses in lockstep, by the true state and by telemetry."""
     folder = command.out / firmware.name
     argv = ["scripts/firmware_steps.py", "--seeds", str(command.flights)]
     if firmware.path is not None:
         argv += ["--px4-dir", str(firmware.path)]
     elif firmware.release is not None:
         argv += ["--px4-release", firmware.release]
-    found = folder / "steps.partial"
-    run([*argv, "--json", str(found)], folder / "steps.log")
-    return read(found)
+    found = {name: folder / f"steps-{name}.partial" for name in ("true", "estimated")}
+    argv += ["--json", str(found["true"]), "--estimated", str(found["estimated"])]
+    run(argv, folder / "steps.log")
+    return {name: read(file) for name, file in found.items()}
 
 
 def conformance(command: Command, firmware: Firmware) -> dict[str, Any]:
-    """Return the result of airl conformance."""
+    """Return the result of airl conformance; the steps are flown in lockstep, see `steps`."""
     folder, speed = command.out / firmware.name, speed_of(command)
     found = folder / "conformance.partial.json"
-    argv = ["-m", "airl_mav.cli.main", "conformance", "--speed", f"{speed:g}"]
+    argv = ["-m", "airl_mav.cli.main", "conformance", "--skip-steps", "--speed", f"{speed:g}"]
     with flying(command, firmware, speed) as vehicle:
         argv += ["--connect", f"udpin://127.0.0.1:{vehicle.port}", "--out", str(found)]
         run(argv, folder / "conformance.log", accepted=(0, 1))
@@ -433,6 +435,19 @@ def step_rows(real: Results, builtin: Results | None) -> list[Row]:
     return rows
 
 
+def judged_steps(estimated: Results, number: int) -> Row:
+    """Return the row of the steps that differ from the stored column of the release."""
+    column, title = stored_release("PX4", number)
+    reference = load_profile("conformance", column, Reference)
+    outside = []
+    for name, figures in estimated.items():
+        step = StepResponse(**figures)
+        found = deviations(step, reference.steps[name], reference.tolerance)
+        outside += [f"{name} {each}" for each in found]
+    text = title if ":" in title else reference.title
+    return Row("steps beyond the stored column", f"{text}: {'; '.join(outside) or 'none'}")
+
+
 def outcome_row(name: str, real: Sequence[str], builtin: Sequence[str] | None, n: int) -> Row:
     """Return a row of failed checks or tests of `n`."""
 
@@ -498,7 +513,8 @@ def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) 
         text = title.format(**found)
         rows.append(Row("version", text, title.format(**other) if other else ""))
     if found := real.get("steps"):
-        rows += step_rows(found, builtin.get("steps"))
+        rows += step_rows(found["true"], builtin["steps"]["true"] if "steps" in builtin else None)
+        rows.append(judged_steps(found["estimated"], real["identity"]["number"]))
     if found := real.get("paired"):
         for policy in found:
             folders = [out / each / f"paired-{policy}" for each in (name, beside)]
@@ -611,12 +627,18 @@ def fly_part(command: Command, firmware: Firmware, part: str) -> bool:
 
 
 def builtin_for(out: Path, firmware: Firmware) -> Firmware:
-    """Return the built-in flight controller of the firmware's release, if it has releases."""
+    """Return the built-in flight controller of the nearest release."""
     file = out / firmware.name / "identity.json"
-    if "px4_release" not in Aircraft.model_fields or firmware.kind != "px4" or not file.exists():
-        return Firmware("builtin")
-    release = read(file)["release"]
+    if firmware.kind != "px4" or not file.exists():
+        return Firmware(f"builtin-{CURRENT}", release=CURRENT)
+    number = read(file)["number"] >> 16
+    release = min(get_args(PX4ReleaseName), key=lambda name: abs(_number(name) - number))
     return Firmware(f"builtin-{release}", release=release)
+
+
+def _number(release: str) -> int:
+    major, minor = map(int, release.split("."))
+    return major << 8 | minor
 
 
 def main(command: Command) -> int:

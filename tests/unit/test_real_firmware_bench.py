@@ -48,7 +48,12 @@ def test_calls_that_only_one_firmware_answers_are_not_comparable(bench: Any) -> 
 
 
 def step(latency_s: float, overshoot_percent: float) -> dict[str, float]:
-    return {"latency_s": latency_s, "rise_s": 1.0, "overshoot_percent": overshoot_percent}
+    rest = dict.fromkeys(("t10_s", "t50_s", "error", "settle_s"), 0.0)
+    return {"latency_s": latency_s, "rise_s": 1.0, "overshoot_percent": overshoot_percent, **rest}
+
+
+def steps(north_2: dict[str, float]) -> dict[str, Any]:
+    return {kind: {"north-2": north_2} for kind in ("true", "estimated")}
 
 
 def test_a_step_is_shown_with_its_difference(bench: Any) -> None:
@@ -62,7 +67,7 @@ def test_a_step_is_shown_with_its_difference(bench: Any) -> None:
 
 def test_versions_of_px4_and_ardupilot(bench: Any) -> None:
     px4 = bench.version_of(0x01110180, bytes.fromhex("bacdaf15fefa5f15"))
-    assert px4 == {"version": "1.17.1 beta", "release": "1.17", "git": "155ffafe15"}
+    assert px4 == {"version": "1.17.1 beta", "number": 0x01110180, "git": "155ffafe15"}
     copter = bench.version_of(0x04070000, b"c0ffee12")
     assert (copter["version"], copter["git"]) == ("4.7.0 dev", "c0ffee12")
 
@@ -70,15 +75,15 @@ def test_versions_of_px4_and_ardupilot(bench: Any) -> None:
 def test_a_firmware_without_a_part_has_a_dash(bench: Any, tmp_path: Path) -> None:
     px4, copter = bench.Firmware("1.17", "px4", tmp_path), bench.Firmware("copter", "ardupilot")
     builtin = bench.Firmware("builtin")
-    version = {"version": "1.17.0", "release": "1.17", "git": "abc"}
+    version = {"version": "1.17.0", "number": 0x011100FF, "git": "abc"}
     checks = [
         {"name": "arm", "outcome": "pass"},
         {"name": "land", "outcome": "fail", "finding": "x"},
     ]
     for name, part, data in (
         ("1.17", "identity", version),
-        ("1.17", "steps", {"north-2": step(0.22, 5.0)}),
-        ("builtin", "steps", {"north-2": step(0.20, 3.5)}),
+        ("1.17", "steps", steps(step(0.22, 5.0))),
+        ("builtin", "steps", steps(step(0.20, 3.5))),
         ("copter", "identity", version),
         ("copter", "conformance", {"checks": checks}),
     ):
@@ -93,7 +98,18 @@ def test_a_firmware_without_a_part_has_a_dash(bench: Any, tmp_path: Path) -> Non
     assert "- copter: land: x" in lines
     data = json.loads((tmp_path / "drift.json").read_text())
     assert data["1.17"]["rows"][0]["real"] == "1.17.0 (abc)"
-    assert data["parts"]["builtin"]["steps"]["north-2"]["latency_s"] == 0.20
+    assert data["parts"]["builtin"]["steps"]["true"]["north-2"]["latency_s"] == 0.20
+    (judged,) = [row for row in data["1.17"]["rows"] if row["figure"].startswith("steps beyond")]
+    assert "north-2 latency in ms 220, stored" in judged["real"]
+
+
+def test_the_built_in_one_has_the_nearest_release(bench: Any, tmp_path: Path) -> None:
+    for number, release in ((0x010E03FF, "1.16"), (0x01110080, "1.17"), (0x011400FF, "1.18")):
+        (tmp_path / "px4").mkdir(exist_ok=True)
+        (tmp_path / "px4" / "identity.json").write_text(json.dumps({"number": number}))
+        found = bench.builtin_for(tmp_path, bench.Firmware("px4", "px4", tmp_path))
+        assert found.options == ["--px4-release", release]
+    assert bench.builtin_for(tmp_path, bench.Firmware("copter", "ardupilot")).path is None
 
 
 @pytest.mark.parametrize("word", ["px4", "=/opt/px4", "a=", "builtin=/opt/px4"])
