@@ -33,6 +33,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.rotation import yaw_of
 from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.external.px4_sitl import EPOCH_US
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 ALTITUDE_M, SETTLE_S = 10.0, 6.0
@@ -110,9 +111,12 @@ class Telemetry(VehicleEnd):
         """Return the received frames, see `VehicleEnd`."""
         return self._read(self._end.after_tick(expected=expected))
 
-    def motion(self) -> telemetry.EstimatedMotion:
-        """Return the estimated motion."""
-        return telemetry.EstimatedMotion(*(np.array(self._rows[number]) for number in ESTIMATED))
+    def motion(self, ahead_s: float) -> telemetry.EstimatedMotion:
+        """Return the estimated motion; the vehicle's clock is ahead of simulated time."""
+        parts = [np.array(self._rows[number]) for number in ESTIMATED]
+        for part in parts:
+            part[:, 0] -= ahead_s
+        return telemetry.EstimatedMotion(*parts)
 
     def _read(self, frames: list[bytes]) -> list[bytes]:
         for frame in frames:
@@ -168,7 +172,10 @@ def flown_steps(aircraft: Aircraft, seed: int) -> tuple[Steps, Steps]:
 
         stage.firmware.on_ticks = truth.add
         stage.run(EpisodeSetup(vehicle, None, seed, aircraft=aircraft), program)
-    return _measured(truth.motion(), sent), _measured(heard.motion(), sent)
+    true = truth.motion()
+    # PX4's first sample is at EPOCH_US of its clock.
+    ahead_s = (EPOCH_US / US_PER_S - true.position[0, 0]) if aircraft.firmware == "px4" else 0.0
+    return _measured(true, sent), _measured(heard.motion(ahead_s), sent)
 
 
 def _measured(

@@ -68,10 +68,7 @@ def version_name(flight_sw_version: int) -> str:
 
 
 def stored_release(firmware: str, flight_sw_version: int) -> tuple[str, str]:
-    """Return the conformance column of a firmware, PX4 or ArduPilot, and its name and version.
-
-    An unknown release gets the nearest column; its name says so.
-    """
+    """Return the column of a release of PX4 or ArduPilot, or the nearest one, and a title."""
     title = f"{firmware} {version_name(flight_sw_version)}"
     distances = {}
     for name in list_profiles("conformance"):

@@ -199,8 +199,7 @@ class ExternalFlightStack:
             self.version = stored_release(airframe.firmware, observer.version)[1]
         if lacking := sorted(parameters.absent.difference(airframe.also_read)):
             raise interfaces.FirmwareMissingError(
-                f"{self.version} has no parameter {_some(lacking)}: remove it from the vehicle's"
-                " profile, or fly a release that has it"
+                f"{self.version} lacks {_some(lacking)}: accepted: a vehicle profile without it"
             )
         problem = airframe.problem(parameters.values)
         if problem is not None:
@@ -209,9 +208,12 @@ class ExternalFlightStack:
             wanted = airframe.settings
             self._until(tick, self._asking(lambda: parameters.set(wanted)), "set parameters")
         elif different := differences(parameters.values, airframe.settings):
-            self._say(f"{airframe.firmware} is not configured as the vehicle: {_some(different)}")
+            self._say(
+                autopilot_state.Severity.WARNING,
+                f"{airframe.firmware} is not configured as the vehicle: {_some(different)}",
+            )
         self._until(tick, lambda: observer.ready, "its report that it may be armed")
-        self._say(self.version, autopilot_state.Severity.INFO)
+        self._say(autopilot_state.Severity.INFO, self.version)
 
     def close(self) -> None:
         """Stop the firmware if it was started here, and close the observer."""
@@ -255,9 +257,7 @@ class ExternalFlightStack:
                     f"{observer.last_text or 'nothing'}"
                 )
 
-    def _say(
-        self, text: str, severity: autopilot_state.Severity = autopilot_state.Severity.WARNING
-    ) -> None:
+    def _say(self, severity: autopilot_state.Severity, text: str) -> None:
         if self._observer.on_message is not None:
             self._observer.on_message(autopilot_state.OperatorText(severity, text))
 

@@ -219,10 +219,10 @@ class ExpectedLoss(NamedTuple):
     """Earliest and latest time of the reaction, from the last setpoint [s]."""
     text: str
     """Part of the STATUSTEXT that reports it; "": none, the reaction is detected by speed."""
-    mode: int
-    """HEARTBEAT.custom_mode during it."""
-    descends: bool
-    """True if it descends level, slowed by drag alone; False if it brakes and hovers."""
+    modes: tuple[int, ...]
+    """Accepted values of HEARTBEAT.custom_mode during it."""
+    down_m_s: tuple[float, float] | None
+    """Minimum and maximum speed down after it [m/s]; None if it brakes and hovers."""
 
 
 class Autopilot(NamedTuple):
@@ -261,6 +261,7 @@ def _px4_mode(main: int, sub: int = 0) -> int:
 
 
 _PX4_HOLD, _PX4_OFFBOARD, _PX4_POSITION = _px4_mode(4, 3), _px4_mode(6), _px4_mode(3)
+_PX4_RETURN = _px4_mode(4, 5)
 
 PX4 = Autopilot(
     title="PX4",
@@ -272,7 +273,7 @@ PX4 = Autopilot(
     after_takeoff_mode=_PX4_HOLD,
     mode_names={_px4_mode(1): "MANUAL", _px4_mode(2): "ALTCTL", _PX4_POSITION: "POSCTL"}
     | {_px4_mode(4, 2): "TAKEOFF", _PX4_HOLD: "HOLD", _px4_mode(4, 4): "MISSION"}
-    | {_px4_mode(4, 5): "RTL", _px4_mode(4, 6): "LAND"}
+    | {_PX4_RETURN: "RTL", _px4_mode(4, 6): "LAND"}
     | {_PX4_OFFBOARD: "OFFBOARD", _px4_mode(7): "STABILIZED"},
     offboard_on_ground=ExpectedAnswer(MavResult.ACCEPTED),
     arms_without_setpoint=False,
@@ -284,9 +285,18 @@ PX4 = Autopilot(
     frames=dict.fromkeys(MavFrame, Reaction.REFUSED)
     | dict.fromkeys((MavFrame.LOCAL_NED, MavFrame.BODY_NED), Reaction.FLOWN),
     ignore_all=Reaction.REFUSED,
-    # COM_OF_LOSS_T = 1 s; 1.06 to 1.13 s measured.
-    loss=ExpectedLoss((1.0, 1.5), "Failsafe activated", _PX4_POSITION, descends=True),
+    # COM_OF_LOSS_T = 1 s; 1.06 to 1.13 s measured. MPC_LAND_SPEED = 0.7 m/s.
+    loss=ExpectedLoss((1.0, 1.5), "Failsafe activated", (_PX4_POSITION,), (0.3, 1.2)),
 )
+# Return climbs with MPC_Z_V_AUTO_UP = 3 m/s. PX4 1.17 has it since its last beta.
+_RETURN = PX4.loss._replace(modes=(_PX4_RETURN,), down_m_s=(-3.5, 0.5))
+_EITHER = PX4.loss._replace(modes=(_PX4_POSITION, _PX4_RETURN), down_m_s=(-3.5, 1.2))
+_REJECTED = ExpectedAnswer(MavResult.TEMPORARILY_REJECTED)
+RELEASES: Mapping[str, Autopilot] = {
+    "px4-1.17": PX4._replace(loss=_EITHER),
+    "px4-1.18": PX4._replace(loss=_RETURN, unknown_mode=_REJECTED),
+}
+"""Behaviour of releases that differs, by the name of their column."""
 
 _GUIDED, _BRAKE, _LOITER = 4, 17, 5
 
@@ -308,7 +318,7 @@ ARDUPILOT = Autopilot(
     frames=dict.fromkeys(MavFrame, Reaction.FLOWN) | {MavFrame.BODY_FRD: Reaction.IGNORED},
     ignore_all=Reaction.IGNORED,
     # GUID_TIMEOUT = 3 s; it began to brake after 3.05 s.
-    loss=ExpectedLoss((2.9, 3.6), "", _GUIDED, descends=False),
+    loss=ExpectedLoss((2.9, 3.6), "", (_GUIDED,), None),
 )
 
 AUTOPILOTS: Mapping[int, Autopilot] = {12: PX4, 3: ARDUPILOT}

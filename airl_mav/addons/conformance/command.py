@@ -13,6 +13,7 @@ from rich.console import Console
 
 from airl_mav.addons.conformance import flight_checks, telemetry
 from airl_mav.addons.conformance.checklist import (
+    RELEASES,
     CheckFailedError,
     Checklist,
     Transcript,
@@ -142,6 +143,7 @@ def _check(vehicle: VehicleConnection, checklist: Checklist, result: Conformance
     title, number = vehicle.autopilot.title, fields["flight_sw_version"]
     column, result.firmware = loading.stored_release(title, number)
     vehicle.transcript.add("note", result.firmware)
+    vehicle.autopilot = RELEASES.get(column, vehicle.autopilot)
     column = column if settings.reference == AUTO else settings.reference
     result.reference = loading.load_profile("conformance", column, Reference)
     vehicle.unasked_hz = result.reference.streams_hz

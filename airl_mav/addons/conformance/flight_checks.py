@@ -37,8 +37,6 @@ PROBE_S = 0.8
 OBSERVE_S = 1.8  # Observation time of its effect, from its first message [s]
 RECOVER_S = 2.0  # Stop time after it [s]
 BRAKING = 0.9  # Share of the speed below which a vehicle is braking
-# Minimum and maximum descent after a loss; PX4: MPC_LAND_SPEED, 0.7 m/s [m/s].
-DESCENT_M_S = (0.3, 1.2)
 # Time error of a STATUSTEXT, stamped by the previous telemetry [s].
 TEXT_TIME_S = 0.02
 LOSS_MARGIN_S = 2.0  # Additional wait for the reaction to a loss [s]
@@ -251,13 +249,13 @@ def _lose_setpoints(vehicle: VehicleConnection) -> str:
         slower = np.flatnonzero(north < BRAKING * cruise)
         checklist.require(slower.size, f"flies on at {north[-1]:.2f} m/s after {wait_s:g} s")
         reaction_s, how = float(motion.position[slower[0], 0]) - last_s, "brakes"
-    right_mode = vehicle.reaches_mode(expected.mode)
+    right_mode = vehicle.reaches_mode(*expected.modes)
     finding = f"{how} {reaction_s:.2f} s after the last setpoint, {vehicle.mode_name}"
     finding += f", {_motion_after_loss(vehicle, cruise)}"
     checklist.require(
         right_mode and earliest_s - TEXT_TIME_S <= reaction_s <= latest_s + TEXT_TIME_S,
         f"{finding}; expected: {earliest_s:g} to {latest_s:g} s, "
-        f"{vehicle.autopilot.mode_name(expected.mode)}",
+        f"{' or '.join(map(vehicle.autopilot.mode_name, expected.modes))}",
     )
     return finding
 
@@ -268,15 +266,14 @@ def _motion_after_loss(vehicle: VehicleConnection, cruise: float) -> str:
     def level_m_s() -> float:
         return math.hypot(*vehicle.velocity_m_s[:2])
 
-    if not vehicle.autopilot.loss.descends:
+    if (limits := vehicle.autopilot.loss.down_m_s) is None:
         stands = vehicle.wait_for(lambda: level_m_s() < STANDING_M_S, STOP_S)
         checklist.require(stands, f"still moves at {level_m_s():.2f} m/s")
         return "stands"
     vehicle.wait(FLY_S)
     down = float(vehicle.telemetry.recent(1.0).velocity[:, 2].mean())
     finding = f"{level_m_s():.2f} m/s level and {down:.2f} m/s down after {FLY_S:g} s"
-    slowest, fastest = DESCENT_M_S
-    checklist.require(slowest < down < fastest and level_m_s() < BRAKING * cruise, finding)
+    checklist.require(limits[0] < down < limits[1] and level_m_s() < BRAKING * cruise, finding)
     return finding
 
 
