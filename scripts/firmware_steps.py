@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.addons.conformance import telemetry
 from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.progress import new_console
 from airl_mav.lockstep.stage import LockstepStage
 from airl_mav.lockstep.vehicle import VehicleEnd, builtin_vehicle, real_vehicle
@@ -172,10 +172,9 @@ def flown_steps(aircraft: Aircraft, seed: int) -> tuple[Steps, Steps]:
 
         stage.firmware.on_ticks = truth.add
         stage.run(EpisodeSetup(vehicle, None, seed, aircraft=aircraft), program)
-    true = truth.motion()
-    # PX4's first sample is at EPOCH_US of its clock.
-    ahead_s = (EPOCH_US / US_PER_S - true.position[0, 0]) if aircraft.firmware == "px4" else 0.0
-    return _measured(true, sent), _measured(heard.motion(ahead_s), sent)
+    # PX4's first sample, of the first tick, is at EPOCH_US of its clock.
+    ahead_s = (EPOCH_US - TICK_US) / US_PER_S if aircraft.firmware == "px4" else 0.0
+    return _measured(truth.motion(), sent), _measured(heard.motion(ahead_s), sent)
 
 
 def _measured(

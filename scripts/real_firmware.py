@@ -230,11 +230,11 @@ def read_version(vehicle: Vehicle) -> dict[str, Any]:
     link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{vehicle.port}", source_system=245)
     with closing(link):
         # The vehicle's address is known from its first datagram.
-        if link.wait_heartbeat(timeout=30.0) is None:
+        if (beat := link.wait_heartbeat(timeout=30.0)) is None:
             raise PartError("no heartbeat")
         for _ in range(20):
             link.mav.command_long_send(
-                *(vehicle.system, 1, dialect.MAV_CMD_REQUEST_MESSAGE, 0),
+                *(beat.get_srcSystem(), 1, dialect.MAV_CMD_REQUEST_MESSAGE, 0),
                 *(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION, 0, 0, 0, 0, 0, 0),
             )
             found = link.recv_match(type="AUTOPILOT_VERSION", blocking=True, timeout=2.0)
