@@ -398,7 +398,7 @@ def test_a_failed_essential_check_ends_its_table_and_steps_alone_need_fewer() ->
 def test_verdict(found: dict[str, Any], verdict: str) -> None:
     checklist, _ = a_checklist()
     checklist.perform("arm", lambda: "armed")
-    checklist.perform("land", lambda: str(require(False, "not reached")))
+    checklist.perform("land", lambda: require(False, "not reached"))
     result = a_result(checklist, **found)
     assert result.verdict == verdict
     assert not result.passed

@@ -133,10 +133,11 @@ class NotApplicableError(Exception):
     """The check does not apply to this vehicle; the message is the reason."""
 
 
-def require(condition: object, finding: str) -> None:
-    """Raise CheckFailedError with a finding unless a condition is true."""
+def require(condition: object, finding: str) -> str:
+    """Return a finding, or raise CheckFailedError with it unless a condition is true."""
     if not condition:
         raise CheckFailedError(finding)
+    return finding
 
 
 class CheckDefinition(NamedTuple):

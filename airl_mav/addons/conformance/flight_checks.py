@@ -212,8 +212,7 @@ def _nan_velocity(stream: SetpointStream, vehicle: VehicleConnection) -> str:
     vehicle.wait(RECOVER_S / 2)
     finding = f"{mode_name}, ({north:.2f}, {east:.2f}, {down:.2f}) m/s"
     stands = math.hypot(north, east, down) < STANDING_M_S
-    checklist.require(mode == vehicle.autopilot.offboard_mode and stands, finding)
-    return finding
+    return checklist.require(mode == vehicle.autopilot.offboard_mode and stands, finding)
 
 
 # --- loss of setpoints
@@ -273,8 +272,9 @@ def _motion_after_loss(vehicle: VehicleConnection, cruise: float) -> str:
     vehicle.wait(FLY_S)
     down = float(vehicle.telemetry.recent(1.0).velocity[:, 2].mean())
     finding = f"{level_m_s():.2f} m/s level and {down:.2f} m/s down after {FLY_S:g} s"
-    checklist.require(limits[0] < down < limits[1] and level_m_s() < BRAKING * cruise, finding)
-    return finding
+    return checklist.require(
+        limits[0] < down < limits[1] and level_m_s() < BRAKING * cruise, finding
+    )
 
 
 def _resume_setpoints(vehicle: VehicleConnection) -> str:
@@ -284,8 +284,7 @@ def _resume_setpoints(vehicle: VehicleConnection) -> str:
         vehicle.wait(FLY_S)
         north = float(vehicle.telemetry.recent(0.5).velocity[:, 0].mean())
     finding = f"{vehicle.mode_name}, {north:.2f} m/s"
-    checklist.require(offboard and abs(north - CRUISE_M_S) < VELOCITY_M_S, finding)
-    return finding
+    return checklist.require(offboard and abs(north - CRUISE_M_S) < VELOCITY_M_S, finding)
 
 
 # --- the end of the flight
@@ -328,10 +327,9 @@ def _land(vehicle: VehicleConnection) -> str:
     phases = telemetry.landed_states[before:]
     finding = f"{_names(phases)} after {telemetry.boot_s - start_s:.1f} s"
     checklist.require(right_mode, f"{finding}; it was never in {vehicle.autopilot.mode_name(mode)}")
-    checklist.require(
+    return checklist.require(
         phases[-2:] == [checklist.LandedState.LANDING, checklist.LandedState.ON_GROUND], finding
     )
-    return finding
 
 
 def _auto_disarm(vehicle: VehicleConnection) -> str:

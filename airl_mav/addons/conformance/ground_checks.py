@@ -170,8 +170,7 @@ def _offboard_without_setpoint(vehicle: VehicleConnection) -> str:
     vehicle.set_mode(autopilot.hold, "back")
     vehicle.reaches_mode(*autopilot.hold_modes)
     finding += f"; arming then: {refused or 'SUCCESS'}"
-    checklist.require(refused == "COMMAND_DENIED", finding)
-    return finding
+    return checklist.require(refused == "COMMAND_DENIED", finding)
 
 
 def _arm(vehicle: VehicleConnection) -> str:
