@@ -242,12 +242,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @cache
 def sources_digest() -> str:
-    """Return the digest of all code that decides flights, without commands and reports."""
+    """Return the digest of code and tables that decide flights: no commands, reports, profiles."""
     digests = sorted(
         hashlib.sha256(file.read_bytes()).digest()
         for package in ("airl_mav", "companion", "firmware_sim")
-        for file in (ROOT / package).rglob("*.py")
-        if file.relative_to(ROOT).parts[:2] not in (("airl_mav", "cli"), ("airl_mav", "report"))
+        for file in (ROOT / package).rglob("*.*")
+        if file.suffix in (".py", ".toml")
+        and file.relative_to(ROOT).parts[1] not in ("cli", "report", "_profiles")
     )
     return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
 

@@ -137,6 +137,11 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     return _overlaid(_read(kind, _path(kind, base), (*above, path)), data)
 
 
+def read_table(module: str) -> dict[str, Any]:
+    """Return the table beside a module: the TOML file with the name of the file `module`."""
+    return read_toml(Path(module).with_suffix(".toml"))
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file. Raises UsageError."""
     data = read_limited(path, "a profile", MOST_BYTES)

@@ -1,6 +1,6 @@
 """Fast streams: packed from one table in compiled code, many ticks at a time.
 
-Each message of `FIELDS` lists a source per field, in order of definition; offsets and wire types
+Each message of telemetry.toml lists a source per field, in order; offsets and wire types
 are pymavlink's. Sources are computed once per tick in which a message is due. Units and "unknown"
 values: MAVLink common.xml and PX4 src/modules/mavlink/streams/*.hpp.
 """
@@ -22,6 +22,7 @@ from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.frames import HOME, Geodetic, Vector, geodetic_to_local, local_to_geodetic
 from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.profiles.loading import read_table
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot import error_state as es
@@ -39,31 +40,8 @@ register_jitable(detectors.current_a)
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-_SOURCES: Final = (
-    *("zero", "nan", "one", "healthy", "located"),
-    *("time_us", "boot_ms", "sync_ns"),
-    *("roll", "pitch", "yaw", "qw", "qx", "qy", "qz", "p", "q", "r"),
-    *("x", "y", "z", "vx", "vy", "vz"),
-    *("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw", "var_vx", "var_vy", "var_vz"),
-    *("lat_e7", "lon_e7", "alt_mm", "above_home_mm", "vx_cm", "vy_cm", "vz_cm", "yaw_cdeg"),
-    *("ax", "ay", "az", "wx", "wy", "wz", "mag_x", "mag_y", "mag_z"),
-    *("pressure", "pressure_alt", "temperature", "imu_fields"),
-    *("amsl", "up", "above_home", "terrain", "clearance"),
-    *("ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
-    *("sp_qw", "sp_qx", "sp_qy", "sp_qz", "sp_p", "sp_q", "sp_r", "sp_thrust"),
-    *("sp_mask", "sp_x", "sp_y", "sp_z", "sp_vx", "sp_vy", "sp_vz", "sp_ax", "sp_ay", "sp_az"),
-    *("sp_yaw", "sp_yaw_rate"),
-    *("pwm_1", "pwm_2", "pwm_3", "pwm_4", "pwm_off"),
-    *("local_ned", "autopilot", "global_int", "four", "ppm", "all_escs", "unknown_u16"),
-    *("goal_known", "goal_lat_e7", "goal_lon_e7", "goal_amsl", "goal_yaw"),
-    *("fix_known", "fix_type", "fix_lat_e7", "fix_lon_e7", "fix_mm", "fix_cm_s", "fix_cdeg"),
-    *("satellites", "eph_mm", "epv_mm"),
-    *("esc_cdeg_1", "esc_cdeg_2", "esc_cdeg_3", "esc_cdeg_4"),
-    *("rpm_1", "rpm_2", "rpm_3", "rpm_4", "volt"),
-    *("ampere_1", "ampere_2", "ampere_3", "ampere_4"),
-    *("parts_present", "parts_enabled", "parts_healthy", "load", "parachute"),
-    *("battery_mv", "battery_ca", "battery_percent"),
-)
+_TABLES = read_table(__file__)
+_SOURCES: Final = tuple(_TABLES["sources"].split())
 _AT: Final = {name: place for place, name in enumerate(_SOURCES)}
 
 # One bit per group of sources, see `_PART_OF`.
@@ -78,93 +56,10 @@ _PART_OF: Final = {
 }
 """Groups of sources that are computed only if a message uses one of them."""
 
-_POSE_DIAGONAL = ("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw")
-_VELOCITY_DIAGONAL = ("var_vx", "var_vy", "var_vz", "nan", "nan", "nan")
-
-
-def _triangle(diagonal: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the sources of a 6 x 6 matrix with a known diagonal."""
-    places = iter(diagonal)
-    return tuple(next(places) if i in units.DIAGONAL else "nan" for i in range(21))
-
-
 FIELDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "ATTITUDE": ("boot_ms", "roll", "pitch", "yaw", "p", "q", "r"),
-        "ATTITUDE_QUATERNION": ("boot_ms", "qw", "qx", "qy", "qz", "p", "q", "r", *("zero",) * 4),
-        "LOCAL_POSITION_NED": ("boot_ms", "x", "y", "z", "vx", "vy", "vz"),
-        "ODOMETRY": (
-            *("time_us", "local_ned", "local_ned", "x", "y", "z", "qw", "qx", "qy", "qz"),
-            *("vx", "vy", "vz", "p", "q", "r"),
-            *_triangle(_POSE_DIAGONAL),
-            *_triangle(_VELOCITY_DIAGONAL),
-            *("zero", "autopilot", "zero"),
-        ),
-        "GLOBAL_POSITION_INT": (
-            *("boot_ms", "lat_e7", "lon_e7", "alt_mm", "above_home_mm"),
-            *("vx_cm", "vy_cm", "vz_cm", "yaw_cdeg"),
-        ),
-        "HIGHRES_IMU": (
-            *("time_us", "ax", "ay", "az", "wx", "wy", "wz", "mag_x", "mag_y", "mag_z"),
-            *("pressure", "zero", "pressure_alt", "temperature", "imu_fields", "zero"),
-        ),
-        "ALTITUDE": (
-            *("time_us", "pressure_alt", "amsl", "up", "above_home", "terrain", "clearance"),
-        ),
-        "ATTITUDE_TARGET": (
-            *("boot_ms", "zero", "sp_qw", "sp_qx", "sp_qy", "sp_qz", "sp_p", "sp_q", "sp_r"),
-            *("sp_thrust", "zero", "zero", "zero"),
-        ),
-        "POSITION_TARGET_LOCAL_NED": (
-            *("boot_ms", "local_ned", "sp_mask", "sp_x", "sp_y", "sp_z", "sp_vx", "sp_vy"),
-            *("sp_vz", "sp_ax", "sp_ay", "sp_az", "sp_yaw", "sp_yaw_rate"),
-        ),
-        "SERVO_OUTPUT_RAW": (
-            *("time_us", "zero", "pwm_1", "pwm_2", "pwm_3", "pwm_4"),
-            *("pwm_off",) * 12,
-        ),
-        # Health bits, load [0.1 %], battery [mV], [10 mA], [%]; no communication errors.
-        "SYS_STATUS": (
-            *("parts_present", "parts_enabled", "parts_healthy", "load"),
-            *("battery_mv", "battery_ca", "battery_percent"),
-            *(*("zero",) * 8, "parachute"),
-        ),
-        "VFR_HUD": ("zero", "ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
-        # TIMESYNC request of the vehicle.
-        "TIMESYNC": ("zero", "sync_ns"),
-        # Target of an automatic mode, and the current velocity setpoint.
-        "POSITION_TARGET_GLOBAL_INT": (
-            *("boot_ms", "global_int", "zero", "goal_lat_e7", "goal_lon_e7", "goal_amsl"),
-            *("sp_vx", "sp_vy", "sp_vz", "sp_ax", "sp_ay", "sp_az", "goal_yaw", "zero"),
-        ),
-        # Newest fix. Dilution of precision is unknown.
-        "GPS_RAW_INT": (
-            *("time_us", "fix_type", "fix_lat_e7", "fix_lon_e7", "fix_mm"),
-            *("unknown_u16", "unknown_u16", "fix_cm_s", "fix_cdeg", "satellites"),
-            *("fix_mm", "eph_mm", "epv_mm"),
-        ),
-        # Four speed controllers, all of them online.
-        "ESC_INFO": (
-            *("zero", "time_us", "zero", "four", "ppm", "all_escs", *("zero",) * 8),
-            *("esc_cdeg_1", "esc_cdeg_2", "esc_cdeg_3", "esc_cdeg_4"),
-        ),
-        "ESC_STATUS": (
-            *("zero", "time_us", "rpm_1", "rpm_2", "rpm_3", "rpm_4", *("volt",) * 4),
-            *("ampere_1", "ampere_2", "ampere_3", "ampere_4"),
-        ),
-    }
+    {name: tuple(sources.split()) for name, sources in _TABLES["fields"].items()}
 )
 """Messages and the sources of their fields."""
-
-NEEDS: Mapping[str, str] = MappingProxyType(
-    {
-        "LOCAL_POSITION_NED": "healthy",
-        "GLOBAL_POSITION_INT": "located",
-        "POSITION_TARGET_GLOBAL_INT": "goal_known",
-        "GPS_RAW_INT": "fix_known",
-    }
-)
-"""Source that must be nonzero; otherwise the message is not sent."""
 
 _IMU_FIELDS = 0b1_1011_1111_1111
 """HIGHRES_IMU_UPDATED_FLAGS: all except differential pressure."""
@@ -200,7 +95,7 @@ def _table() -> _Table:
     heads, fields, first = [], [], [0]
     for name, sources in FIELDS.items():
         kind = dialect.mavlink_map[message_id(name)]
-        need = NEEDS.get(name, "one")
+        need = _TABLES["needs"].get(name, "one")
         parts = 0
         # The message needs each group with at least one of its sources.
         for part, marks in _PART_OF.items():

@@ -44,7 +44,11 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name in ("airl_mav/core/a.py", "airl_mav/report/page.py", "companion/b.py"):
+    for name in ("core/a.py", "core/a.toml", "report/page.py", "_profiles/quad.toml"):
+        file = tmp_path / "airl_mav" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(name)
+    for name in ("companion/b.py",):
         file = tmp_path / name
         file.parent.mkdir(parents=True)
         file.write_text(name)
@@ -56,7 +60,9 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("name", "decides"),
     [
         ("airl_mav/core/a.py", True),
+        ("airl_mav/core/a.toml", True),
         ("companion/b.py", True),
+        ("airl_mav/_profiles/quad.toml", False),
         ("airl_mav/report/page.py", False),
     ],
 )
