@@ -26,7 +26,6 @@ from airl_mav.core.frames import Vector, quat_to_matrix
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import multiply, yaw_of
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_state import ErrorFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 
 CONVERGED_RAD = 0.262
@@ -131,7 +130,7 @@ class Recovery:
     """Monitor of velocities and headings that restarts the filter after faults."""
 
     def __init__(
-        self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any
+        self, state: Vector, error_filter: es.ErrorFilter, yaw: YawEstimator, record: Any
     ) -> None:
         """Store the nominal state and its filter, both updated, yaw estimator and record."""
         self._state, self._filter, self._yaw = state, error_filter, yaw
@@ -144,7 +143,7 @@ class Recovery:
         self._biases_before = state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
         """Biases of gyro and accelerometer (6,) before the fault."""
 
-    def use(self, error_filter: ErrorFilter) -> None:
+    def use(self, error_filter: es.ErrorFilter) -> None:
         """Continue with another filter that carries the same errors."""
         self._filter = error_filter
 

@@ -10,12 +10,10 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
-from firmware_sim.mavlink import codec, message_rates, px4_links, telemetry
+from firmware_sim.mavlink import codec, message_rates, px4_links, streams, telemetry
 from firmware_sim.mavlink.endpoint import Sender
-from firmware_sim.mavlink.streams import Builder
-from firmware_sim.mavlink.telemetry import payload as fast_payload
 
-Payloads = dict[Builder, "bytes | None"]
+Payloads = dict[streams.Builder, "bytes | None"]
 """Payloads built and packed in one tick, common to all links; None = nothing to send, empty =
 values out of range."""
 
@@ -63,8 +61,8 @@ class Link:
     def __init__(
         self,
         config: px4_links.LinkConfig,
-        builders: Mapping[str, Builder | None],
-        replies: Mapping[str, Builder | None] | None = None,
+        builders: Mapping[str, streams.Builder | None],
+        replies: Mapping[str, streams.Builder | None] | None = None,
         *,
         endpoint: Sender | None = None,
         system_id: int = codec.SYSTEM_ID,
@@ -162,7 +160,7 @@ class Link:
         builder = self._replies[name]
         # None marks a stream of the compiled packer.
         if builder is None:
-            payload = fast_payload(name, state)
+            payload = telemetry.payload(name, state)
         else:
             payload = _payload(codec.layout(name), builder(state))
         if payload is None:

@@ -13,7 +13,6 @@ from firmware_sim.addons.auxiliary_estimation.optical_flow import OpticalFlowFus
 from firmware_sim.addons.auxiliary_estimation.range_finder import Aids, RangeFinder
 from firmware_sim.addons.auxiliary_estimation.terrain_filter import TerrainFilter
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_state import KernelFilter, Measurement
 from firmware_sim.autopilot.estimator import Aiding, Estimator
 from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, Received, SensorSample
 
@@ -48,7 +47,7 @@ class AuxiliaryAids(Aiding):
     def warm_up(value: Callable[[str], float]) -> None:
         """Fuse ranges on the ground and in the air: any client may send them at any time."""
         state, n = es.new_state(), es.N_STATES
-        terrain = TerrainFilter(KernelFilter(np.diag(es.INITIAL_SIGMA**2), np.zeros(n)))
+        terrain = TerrainFilter(es.KernelFilter(np.diag(es.INITIAL_SIGMA**2), np.zeros(n)))
         finder = RangeFinder(value, state, terrain, 0)
         aids = Aids(horizontal=True, vertical_speed=True, height_us=0)
         for step in range(1, 2 * _GROUND_STEPS):
@@ -146,7 +145,7 @@ class AuxiliaryAids(Aiding):
             self.range.moved(down_m)
             self._report()
 
-    def correct(self, baro: Measurement) -> None:
+    def correct(self, baro: es.Measurement) -> None:
         """Correct a barometer that is rejected for long if the ground is the height reference."""
         if self.range is not None:
             self.range.correct(baro, self._estimator.time_us)

@@ -19,7 +19,6 @@ from airl_mav.core.frames import Vector, quat_to_matrix
 from airl_mav.vehicle.rotation import conjugate, multiply, normalize, yaw_of
 from firmware_sim.addons.auxiliary_estimation.terrain_filter import reset_variances
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.recovery import turn_to
 from firmware_sim.autopilot.sensor_monitor import LEARN_US
@@ -77,12 +76,14 @@ class ExternalVision:
         """
         self._estimator, self._judge = estimator, judge
         self._value, self._state, self._fuse = estimator.value, estimator.state, estimator.fuse
-        self.horizon = FusionHorizon(0.0)
+        self.horizon = es.FusionHorizon(0.0)
         """Vehicle motion since the measurement time of current odometry (EKF2_EV_DELAY)."""
-        self.position = Measurement("vision_position", 0, selecting(es.POS, es.POS + 1))
-        self.height = Measurement("vision_height", 3, selecting(es.POS + 2))
-        self.velocity = Measurement("vision_velocity", 0, selecting(es.VEL, es.VEL + 1, es.VEL + 2))
-        self.yaw = Measurement("vision_heading", 2, np.zeros((1, es.N_STATES)))
+        self.position = es.Measurement("vision_position", 0, es.selecting(es.POS, es.POS + 1))
+        self.height = es.Measurement("vision_height", 3, es.selecting(es.POS + 2))
+        self.velocity = es.Measurement(
+            "vision_velocity", 0, es.selecting(es.VEL, es.VEL + 1, es.VEL + 2)
+        )
+        self.yaw = es.Measurement("vision_heading", 2, np.zeros((1, es.N_STATES)))
         self.fused = Control(0)
         """Data currently fused."""
         self._newest: Odometry | None = None
@@ -195,7 +196,7 @@ class ExternalVision:
             if self._fuse(m):
                 self.fused |= Control.YAW
 
-    def _is_overdue(self, m: Measurement, now_us: int) -> bool:
+    def _is_overdue(self, m: es.Measurement, now_us: int) -> bool:
         """Return whether a measurement was rejected for EKF2_NOAID_TOUT and needs a reset."""
         since_us = m.fused_us
         return since_us is not None and now_us - since_us > self._value("EKF2_NOAID_TOUT")

@@ -18,7 +18,6 @@ from airl_mav.core.constants import MS_PER_S, TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, quat_to_matrix
 from firmware_sim.addons.auxiliary_estimation import range_finder, sensors, terrain_filter
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_state import FusionHorizon, Measurement, selecting
 from firmware_sim.interfaces import FlowReading
 
 LONGEST_S = 1.0
@@ -61,7 +60,7 @@ class OpticalFlowFusion:
         value: Callable[[str], float],
         state: Vector,
         ground: range_finder.RangeFinder,
-        fuse: Callable[[Measurement], bool],
+        fuse: Callable[[es.Measurement], bool],
     ) -> None:
         """Start without measurements.
 
@@ -71,7 +70,7 @@ class OpticalFlowFusion:
         self._value, self._state = value, state
         self._ground, self._terrain = ground, ground.terrain
         self._fuse_standing = fuse
-        self.horizon = FusionHorizon(0.0)
+        self.horizon = es.FusionHorizon(0.0)
         """Vehicle motion since the middle of the integration time of current measurements: half
         that time plus EKF2_OF_DELAY ago."""
         self.fused = False
@@ -95,8 +94,8 @@ class OpticalFlowFusion:
         self._gyro_bias = np.zeros(3)
         self._smoothed_velocity, self._smoothed_rate = np.zeros(2), np.zeros(2)
         """Body velocity [m/s] and flow [rad/s]."""
-        held = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
-        self.standing = Measurement("standing", 0, held)
+        held = es.selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
+        self.standing = es.Measurement("standing", 0, held)
         """Zero-motion measurement of a vehicle on the ground."""
         self.standing.variance[:] = [_STANDING_M**2] * 2 + [_STANDING_M_S**2] * 2
         self._stands_at: Vector | None = None

@@ -17,7 +17,6 @@ import numpy as np
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.error_state import ErrorFilter, FusionHorizon
 
 STEP_S = 0.01
 """Time step of PX4's filter, 100 Hz [s]; its terrain noises are per step."""
@@ -35,7 +34,7 @@ _OF_RANGE.setflags(write=False)
 """Jacobian of the height above ground by the errors: terrain z minus vehicle z."""
 
 
-def reset_variances(carried: ErrorFilter, variances: Mapping[int, float]) -> None:
+def reset_variances(carried: es.ErrorFilter, variances: Mapping[int, float]) -> None:
     """Set variances of errors by their indices, and clear the correlations of these errors."""
     covariance = carried.covariance.copy()
     for index, variance in variances.items():
@@ -47,7 +46,7 @@ def reset_variances(carried: ErrorFilter, variances: Mapping[int, float]) -> Non
 class TerrainFilter:
     """Implementation of `error_state.ErrorFilter` with a terrain estimate."""
 
-    def __init__(self, inner: ErrorFilter) -> None:
+    def __init__(self, inner: es.ErrorFilter) -> None:
         """Start with the terrain at z = 0; see `put`."""
         self._inner = inner
         self._transition = np.eye(es.N_STATES)
@@ -57,7 +56,7 @@ class TerrainFilter:
         """Variance of the terrain height [m²]."""
         self.cross = np.zeros(es.N_STATES)
         """Covariance (16,) of the terrain height with the errors."""
-        self.horizon = FusionHorizon(SIMULATED_MS)
+        self.horizon = es.FusionHorizon(SIMULATED_MS)
         """Vehicle motion since the measurement time of current ranges (EKF2_RNG_DELAY)."""
         self.walk_m_s, self.slope = 0.0, 0.0
         """EKF2_TERR_NOISE and EKF2_TERR_GRAD; both 0 while the ground is the height reference."""

@@ -16,12 +16,10 @@ from firmware_sim.autopilot import flight_modes
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.snapshot import AutopilotState
-from firmware_sim.mavlink import services
+from firmware_sim.mavlink import message_rates, services
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
-from firmware_sim.mavlink.message_rates import OFF
 from firmware_sim.mavlink.streams import Builder, no_content, sensors, units
 from firmware_sim.mavlink.streams.status import NO_MISSION, base_mode
-from firmware_sim.mavlink.streams.units import boot_ms, percent
 
 
 def fence_status(state: AutopilotState) -> Values:
@@ -61,7 +59,7 @@ def high_latency2(state: AutopilotState) -> Values:
         *(*_place(state), target_altitude),
         *(_heading(quat_yaw(estimate.quaternion)), _heading(quat_yaw(state.attitude_setpoint))),
         target_distance,
-        percent(state.thrust_setpoint) if armed else 0,
+        units.percent(state.thrust_setpoint) if armed else 0,
         *(airspeed, airspeed_setpoint),
         # The unit of speed is 0.2 m/s, hence the factor 5.
         _uint8(math.hypot(north, east) * 5.0),
@@ -70,7 +68,7 @@ def high_latency2(state: AutopilotState) -> Values:
         _INT8_MIN,  # unknown temperature
         # The climb rate has no sign here: [0.1 m/s] in one byte.
         units.saturate(abs(down) * 10.0, 0, 127, 0),
-        percent(state.battery.remaining),
+        units.percent(state.battery.remaining),
         state.mission.current if state.mission.total else NO_MISSION,
         _failures(state),
         *_UNKNOWN_I8,
@@ -123,7 +121,7 @@ def flight_information(state: AutopilotState) -> Values:
     """Return the times of arming and takeoff [µs since boot]; 0 while disarmed."""
     flight_uuid = landing_time = 0
     armed, took_off = state.armed_us, state.takeoff_us
-    return boot_ms(state.time_us), armed, took_off, flight_uuid, landing_time
+    return units.boot_ms(state.time_us), armed, took_off, flight_uuid, landing_time
 
 
 def protocol_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
@@ -262,7 +260,7 @@ def handle_data_stream(message: WireMessage, context: services.Context) -> bool:
         requested_us = US_PER_S // message.req_message_rate
         present_us = scheduler.interval_us(name)
         # Only a shorter interval is set: a request must not slow another client's stream.
-        if present_us == OFF or max(requested_us, 1) < present_us:
+        if present_us == message_rates.OFF or max(requested_us, 1) < present_us:
             scheduler.set_interval(name, max(requested_us, 1), context.now_us)
     return bool(names)
 

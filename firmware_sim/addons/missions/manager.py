@@ -31,11 +31,8 @@ from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.events.definition import define
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes import interface
-from firmware_sim.autopilot.modes.automatic import gentle, landing_speed, leave_ground
-from firmware_sim.autopilot.modes.return_to_launch import return_height
-from firmware_sim.autopilot.navigation import plan
-from firmware_sim.autopilot.navigation.geofence import FenceMonitor
+from firmware_sim.autopilot.modes import automatic, interface, return_to_launch
+from firmware_sim.autopilot.navigation import geofence, plan
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, triple
 
 _N = NavCommand
@@ -220,7 +217,11 @@ class MissionManager(plan.Missions):
     """Executors of Mission and of Return along mission items; `triplet` is the active path."""
 
     def __init__(
-        self, plans: plan.Plans, value: Callable[[str], float], crew: plan.Crew, fence: FenceMonitor
+        self,
+        plans: plan.Plans,
+        value: Callable[[str], float],
+        crew: plan.Crew,
+        fence: geofence.FenceMonitor,
     ) -> None:
         """Store the plans, the look-up for PX4 parameters, the callbacks and the geofence."""
         self._plans, self._value, self._crew, self._fence = plans, value, crew, fence
@@ -331,7 +332,9 @@ class MissionManager(plan.Missions):
             return ()
         ground = self._goal(now).place
         away = plan.distance_m(ground[:2], here[:2])
-        above = return_height(self._value, here.altitude_m - ground.altitude_m, away)
+        above = return_to_launch.return_height(
+            self._value, here.altitude_m - ground.altitude_m, away
+        )
         landing = onwards(self._plans, begin)
         altitude = ground.altitude_m + above
         # Above the return altitude already: no climb.
@@ -399,7 +402,7 @@ class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
         triplet, position, travel = self._path, triple(state, P), context.travel
         if context.standing:
             # The trajectory starts at the vehicle's position at lift-off.
-            return leave_ground(context, state, time_us)
+            return automatic.leave_ground(context, state, time_us)
         if triplet is not self._triplet:
             # A speed that the operator changed since then is kept while the mission's speed is
             # unchanged.
@@ -424,7 +427,7 @@ class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
         yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)
         leg, limits = _leg(triplet, position), self._limits(state)
         if triplet.kind is _LAND:
-            speed = landing_speed(context.value, context.height(state), context.ground_m)
+            speed = automatic.landing_speed(context.value, context.height(state), context.ground_m)
             north, east, _ = triplet.target
             # The ground's height is unknown: descend at a speed until the land detector acts.
             leg = PathSegment((north, east, math.nan), vertical_m_s=speed)
@@ -437,7 +440,9 @@ class MissionMode(interface.FlightMode, modes=(Mode.MISSION,)):
     def _limits(self, state: Vector) -> PathLimits:
         triplet = self._path
         limits = self._context.travel.limits()._replace(acceptance_m=triplet.acceptance_m)
-        return gentle(limits, self._context, state) if triplet.kind is _TAKEOFF else limits
+        return (
+            automatic.gentle(limits, self._context, state) if triplet.kind is _TAKEOFF else limits
+        )
 
     def _heading(self, state: Vector) -> float:
         """Return the heading by MPC_YAW_MODE; NaN = towards the waypoint, unchanged near it."""

@@ -13,7 +13,6 @@ from enum import Enum, auto
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.addons.missions import items
-from firmware_sim.addons.missions.items import MOST_ITEMS
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events.definition import Definition, Level, define
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem, Stored
@@ -250,8 +249,8 @@ def _begin_upload(message: WireMessage, context: services.Context) -> bool:
         transfer.integer = False
     transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
     # An unknown list type has room for 0 items.
-    is_known = transfer.kind in MOST_ITEMS
-    if message.count > (MOST_ITEMS[MissionType(transfer.kind)] if is_known else 0):
+    is_known = transfer.kind in items.MOST_ITEMS
+    if message.count > (items.MOST_ITEMS[MissionType(transfer.kind)] if is_known else 0):
         _acknowledge(context, partner, dialect.MAV_MISSION_NO_SPACE)
     elif message.count == 0:
         if is_known:
@@ -413,7 +412,7 @@ def _end_complete_download(transfer: MissionTransfer) -> None:
 
 
 def _stored(context: services.Context, kind: int) -> Stored:
-    return context.port.plans.stored(MissionType(kind)) if kind in MOST_ITEMS else Stored()
+    return context.port.plans.stored(MissionType(kind)) if kind in items.MOST_ITEMS else Stored()
 
 
 def _request(context: services.Context) -> None:

@@ -27,7 +27,6 @@ from firmware_sim.addons.px4_hitl.line import (
 )
 from firmware_sim.external import flight_stack, launcher, observer, parameters, programs
 from firmware_sim.external import hil_messages as hil
-from firmware_sim.interfaces import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Encoder, Values, WireLayout, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import Endpoint
 
@@ -222,13 +221,15 @@ class BoardLink:
             self._listen()
             problem = self.board.setup_problem()
             if problem is not None:
-                raise FirmwareMissingError(f"--serial {self.device}: the board: {problem}")
+                raise interfaces.FirmwareMissingError(
+                    f"--serial {self.device}: the board: {problem}"
+                )
             if self._router.lost is not None:
                 # The boot loader is a separate USB device, which vanishes when the firmware starts.
                 self.close()
                 returning = True
             elif self.clock.time_us() > deadline_us and not self.board.ready:
-                raise FirmwareMissingError(
+                raise interfaces.FirmwareMissingError(
                     f"--serial {self.device}: no board in HIL mode within {timeout_s:g} s: "
                     + silence(self.board, self._router)
                 )
@@ -242,7 +243,9 @@ class BoardLink:
                 select.select([], [], [], _AGAIN_S)
                 return
             if deadline_us:
-                raise FirmwareLostError(f"the board did not come back: {error}") from error
+                raise interfaces.FirmwareLostError(
+                    f"the board did not come back: {error}"
+                ) from error
             raise
         self.board = Board(self.clock)
         self._router.attach(self._line, self._budget_bytes_s)
@@ -266,7 +269,7 @@ class BoardLink:
                     self.disarm()  # an armed board rejects the reboot
                 self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
             if now_us > deadline_us:
-                raise FirmwareLostError(
+                raise interfaces.FirmwareLostError(
                     f"{self.device}: the board does not reboot (it answered "
                     f"{_result(board.reboot_answer)}): power-cycle it"
                 )

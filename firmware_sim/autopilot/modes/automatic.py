@@ -18,7 +18,6 @@ from firmware_sim.autopilot.climb import SETTLED_M, ClimbLimits
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes import interface
-from firmware_sim.autopilot.modes.interface import ClimbOn, ModeRequest, PositionYaw, Reposition
 from firmware_sim.autopilot.smooth_trajectory import PathLimits, PathSegment, stopping_place, triple
 from firmware_sim.engine.record import RISING, SETTLING
 
@@ -31,7 +30,7 @@ class Takeoff(interface.FlightMode, modes=(Mode.TAKEOFF,)):
 
     def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
-        self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
+        self._place = interface.PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._gently = True
         """True if the take-off started on the ground."""
 
@@ -55,7 +54,7 @@ class Takeoff(interface.FlightMode, modes=(Mode.TAKEOFF,)):
         north, east = self._context.takeoff_place or self._place.position[:2]
         return north, east, self._context.home[2] - self._context.takeoff_altitude_m
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start the climb at the current position."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
         self._place = interface.here(state)
@@ -83,13 +82,13 @@ class Takeoff(interface.FlightMode, modes=(Mode.TAKEOFF,)):
             limits = gentle(limits, context, state)
         return travel.fly(state, time_us, PathSegment(self._end), limits=limits)
 
-    def remainder(self, state: Vector, /) -> ModeRequest | None:
+    def remainder(self, state: Vector, /) -> interface.ModeRequest | None:
         """Return the take-off target for Hold, once near its altitude."""
         if not self.is_done(state):
             return None
         if self._context.takeoff_place is not None:
-            return Reposition(PositionYaw(self._end, interface.NAN))
-        return ClimbOn(PositionYaw(self._end, self._place.yaw))
+            return interface.Reposition(interface.PositionYaw(self._end, interface.NAN))
+        return interface.ClimbOn(interface.PositionYaw(self._end, self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
         """Return whether the take-off is near its altitude, within PX4's acceptance radius.
@@ -151,7 +150,7 @@ class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
 
     def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
-        self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
+        self._place = interface.PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._braking = False
         self._travelling = False
         self._settling = False
@@ -175,14 +174,14 @@ class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
         """Hold position, once known."""
         return None if self._braking else self._place.position
 
-    def enter(self, state: Vector, request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, request: interface.ModeRequest | None, /) -> None:
         """Start: finish a take-off climb, fly to a place, or brake."""
-        self._settling = isinstance(request, ClimbOn)
-        self._travelling = isinstance(request, Reposition)
+        self._settling = isinstance(request, interface.ClimbOn)
+        self._travelling = isinstance(request, interface.Reposition)
         self._braking = not (self._settling or self._travelling)
-        if isinstance(request, ClimbOn):
+        if isinstance(request, interface.ClimbOn):
             self._place = request.place
-        elif isinstance(request, Reposition):
+        elif isinstance(request, interface.Reposition):
             self._go(request, state)
         else:
             self._place = interface.here(state)
@@ -211,7 +210,7 @@ class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
             self._braking = False
         return Demand(self._place.position, interface.FREE, self._place.yaw, interface.NAN)
 
-    def _go(self, request: Reposition, state: Vector) -> None:
+    def _go(self, request: interface.Reposition, state: Vector) -> None:
         """Start the flight to a place; NaN coordinates keep their current value.
 
         Source: PX4 1.16, Navigator: a new height alone keeps the horizontal position; an empty
@@ -227,7 +226,7 @@ class Hold(interface.FlightMode, modes=(Mode.HOLD,)):
             north, east = origin[0], origin[1]
         if math.isnan(down):
             down = now[2]
-        self._place = PositionYaw((north, east, down), place.yaw)
+        self._place = interface.PositionYaw((north, east, down), place.yaw)
         if not math.isnan(request.speed_m_s):
             self._context.travel.speed_m_s = request.speed_m_s
 
@@ -256,7 +255,7 @@ class Land(interface.FlightMode, modes=(Mode.LAND,)):
 
     def __init__(self, context: interface.FlightContext, /) -> None:
         self._context = context
-        self._place = PositionYaw((0.0, 0.0, 0.0), 0.0)
+        self._place = interface.PositionYaw((0.0, 0.0, 0.0), 0.0)
         self._stopping, self._began = False, (0.0, 0.0)
         self._is_slow = False
 
@@ -271,7 +270,7 @@ class Land(interface.FlightMode, modes=(Mode.LAND,)):
         north, east = self._began
         return north, east, self._context.home[2]
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start at the current position."""
         self._place, self._stopping = interface.here(state), True
         self._began = self._place.position[:2]
@@ -322,7 +321,7 @@ class Descend(interface.FlightMode, modes=(Mode.DESCEND,)):
         self._context = context
         self._yaw = 0.0
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start with the current heading."""
         self._yaw = quat_yaw(state[Q:RATES])
 

@@ -18,7 +18,6 @@ from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.error_state import RATES
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes import automatic, interface
-from firmware_sim.autopilot.modes.interface import ModeRequest
 
 CLIMBS_M_S = 0.1
 """Minimum climb rate of a setpoint that lifts a standing vehicle [m/s]."""
@@ -61,7 +60,7 @@ class Offboard(interface.FlightMode, modes=(Mode.OFFBOARD,)):
             return False
         return not isinstance(newest, RateDemand) or not math.isnan(newest.rates[2])
 
-    def enter(self, state: Vector, _request: ModeRequest | None, /) -> None:
+    def enter(self, state: Vector, _request: interface.ModeRequest | None, /) -> None:
         """Start the mode."""
         self._waiting.enter(state, None)
         self._kind_us = 0

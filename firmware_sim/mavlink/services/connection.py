@@ -11,9 +11,8 @@ from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
 from firmware_sim.autopilot.autopilot_state import Arming, OperatorText, Result, Severity
-from firmware_sim.mavlink import services
+from firmware_sim.mavlink import message_rates, services
 from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
-from firmware_sim.mavlink.message_rates import OFF
 from firmware_sim.mavlink.streams import Builder, units
 from firmware_sim.mavlink.texts_and_events import KEPT, NUMBERS, message
 
@@ -41,7 +40,7 @@ def _set_message_interval(command: services.VehicleCommand, context: services.Co
     scheduler = context.link.scheduler
     if interval < 0.0:
         # MAVLink: -1 disables the message, 0 restores the default rate.
-        interval_us = OFF
+        interval_us = message_rates.OFF
     elif interval > 0.0:
         # The upper limit keeps the value in the reply's int32 field; 1 µs is sent every tick.
         interval_us = max(1, round(min(interval, units.INT32_MAX)))
@@ -96,7 +95,7 @@ def _send_interval(number: int, context: services.Context) -> Result:
     name, interval = _stream_name(number, context), _INTERVAL_UNAVAILABLE
     if name is not None:
         interval = context.link.scheduler.interval_us(name)
-        interval = _INTERVAL_UNAVAILABLE if interval == OFF else interval
+        interval = _INTERVAL_UNAVAILABLE if interval == message_rates.OFF else interval
     context.link.send(dialect.MAVLink_message_interval_message(number, interval))
     return Result.ACCEPTED
 

@@ -19,7 +19,6 @@ from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.interfaces import TrueState
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values
 from firmware_sim.mavlink.streams import sensors, status
-from firmware_sim.mavlink.streams.sensors import VibrationMeter
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in order of definition, from a snapshot; None = no content yet.
@@ -76,7 +75,7 @@ class Vehicle:
         """Start without an autopilot; simulated time 0 is at `boot_unix_us` [µs since 1970]."""
         self.boot_unix_us = boot_unix_us
         self.system_id = SYSTEM_ID
-        self.vibration = VibrationMeter()
+        self.vibration = sensors.VibrationMeter()
         self.truth: Callable[[], TrueState] | None = None
 
     def attach(
@@ -84,7 +83,7 @@ class Vehicle:
     ) -> None:
         """Attach another autopilot, with its vehicle's true state; None = unavailable."""
         self.port, self.truth, self.system_id = port, truth, system_id
-        self.vibration = VibrationMeter()
+        self.vibration = sensors.VibrationMeter()
 
 
 VEHICLE_BUILDERS: Mapping[str, Callable[[Vehicle, AutopilotState], Values | None]] = (

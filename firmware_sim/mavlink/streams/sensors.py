@@ -16,7 +16,6 @@ from firmware_sim.autopilot.snapshot import AutopilotState
 from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.streams import units
-from firmware_sim.mavlink.streams.units import UINT16_MAX, boot_ms, percent
 
 if TYPE_CHECKING:
     from firmware_sim.mavlink.streams import Builder
@@ -77,7 +76,7 @@ def battery_status(state: AutopilotState, parameters: Parameters) -> Values:
         units.int16(battery.current_a * 100.0, unknown=-1),
         units.int32(battery.consumed_mah, unknown=-1),
         no_energy,
-        percent(battery.remaining),
+        units.percent(battery.remaining),
         no_time_remaining,
         _charge_state(battery.remaining, parameters),
     )
@@ -216,12 +215,12 @@ class Radio:
             sent = self._count
             channels = self._channels
             # RC_CHANNELS always has 18 values; UINT16_MAX marks the missing ones.
-            unused = (UINT16_MAX,) * (CHANNELS - len(channels))
+            unused = (units.UINT16_MAX,) * (CHANNELS - len(channels))
             signal = _FULL_SIGNAL if channels else 0
-            return boot_ms(self._time_us), len(channels), *channels, *unused, signal
+            return units.boot_ms(self._time_us), len(channels), *channels, *unused, signal
 
         return build
 
 
 def _says_nothing(width: int, place: int) -> bool:
-    return width == UINT16_MAX or (width == 0 and place >= _ZERO_SAYS_NOTHING)
+    return width == units.UINT16_MAX or (width == 0 and place >= _ZERO_SAYS_NOTHING)
