@@ -206,6 +206,9 @@ class LogStore:
         """Return the log currently being written; None = no open log."""
         return None
 
+    def command(self, values: tuple[float, ...], time_us: int) -> None:
+        """Log a command of a client: the fields of vehicle_command, and its time [µs]."""
+
 
 class FirmwareLostError(Exception):
     """External firmware died, hangs or sends invalid data, so the flight is invalid.

@@ -38,6 +38,7 @@ In `firmware_sim.addons`:
     CAPABILITIES: {name: bit of MAV_PROTOCOL_CAPABILITY}
     EVENTS: {name: module with event `Definition`s}
     FLIGHT_LOGS: {name: function that opens a `firmware_sim.firmware.FlightLog`}
+    TOPICS: {name: module of the flight log's topics, for other add-ons}
     FAULT_EFFECTS: {`parts`, `camera` or `link`: class that executes faults there}
 
 Values are text (`module` or `module:name`); `load` imports what they name, on first use.

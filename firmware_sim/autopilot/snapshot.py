@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot import autopilot_state
+from firmware_sim.autopilot.failsafes.failsafe_conditions import Conditions
 from firmware_sim.autopilot.flight_modes import Mode
-from firmware_sim.autopilot.modes.interface import Sticks
+from firmware_sim.autopilot.modes.interface import OffboardSetpoint, Sticks
 from firmware_sim.autopilot.navigation.plan import MissionType, Plans
 from firmware_sim.engine.record import POSITION, TRAJECTORY
 from firmware_sim.interfaces import BatterySample, GpsFix, Received
@@ -119,6 +120,14 @@ class AutopilotState:
     """Newest readings of further sensors by name (`sensor_table.Sensor.reading`)."""
     clearance: autopilot_state.Clearance | None
     """Height above the ground; None before the first range."""
+    conditions: Conditions
+    """Failsafe conditions at the newest check."""
+    offboard: OffboardSetpoint | None
+    """Newest offboard setpoint; None before the first."""
+    offboard_us: int | None
+    """Time of the newest offboard setpoint [µs]."""
+    mixing: tuple[float, float]
+    """Shares of a roll and of a pitch torque in each motor's command."""
 
     def __init__(
         self,
@@ -183,6 +192,10 @@ _READ: dict[str, Callable[[Any], Any]] = {
     "esc_outputs": attrgetter("_autopilot._newest.esc_outputs"),
     "readings": attrgetter("_autopilot.estimator.readings"),
     "clearance": attrgetter("_autopilot.estimator.aiding.ground"),
+    "conditions": attrgetter("_autopilot.supervisor.conditions"),
+    "offboard": attrgetter("_autopilot._guidance.context.setpoint"),
+    "offboard_us": attrgetter("_autopilot.supervisor.watch.setpoint_us"),
+    "mixing": lambda state: state._autopilot.record["gains"][["mix_roll", "mix_pitch"]].item(),
 }
 """Sources of the values of `AutopilotState`."""
 

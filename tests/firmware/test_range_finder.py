@@ -32,6 +32,7 @@ from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external import hil_messages as hil
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
+from firmware_sim.mavlink import telemetry
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.streams import sensors, status
 from firmware_sim.simulation import TOUCHDOWN_M_S
@@ -145,14 +146,13 @@ def test_a_flight_over_a_box() -> None:
     sent_status = status.estimator_status(state)
     assert sent_status[1] & dialect.ESTIMATOR_POS_VERT_AGL
     assert 0.0 < sent_status[6] < 1.0
-    logged = topics.local_position(topics.Moment(state, rig.truth, 0))
-    assert logged[-5:] == (
-        ground.dist_bottom_m,
-        ground.variance_m2,
-        True,
-        ground.resets,
-        1,
-    )
+    (logged,) = (each for each in topics.TOPICS if each.topic.name == "vehicle_local_position")
+    row = logged.messages(topics.Moment(telemetry.flown_of(state), np.zeros(0), state))
+    assert row is not None
+    assert row["dist_bottom"] == pytest.approx(ground.dist_bottom_m)
+    assert row["dist_bottom_var"] == pytest.approx(ground.variance_m2)
+    assert row["dist_bottom_valid"] and row["dist_bottom_reset_counter"] == ground.resets
+    assert row["dist_bottom_sensor_bitfield"] == 1
     # Down to the floor: slowest below MPC_LAND_ALT3.
     rig.stream(velocity_setpoint(0.0, 0.0, 0.0))
     rig.run(2.0)

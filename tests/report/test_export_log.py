@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from airl_mav import Scenario, rehearse
 from airl_mav.addons.export_log.command import flight_of
 from airl_mav.addons.export_log.recorded import RecordedFlight
-from airl_mav.addons.export_log.ulog_log import row, samples, write_ulog
+from airl_mav.addons.export_log.ulog_log import samples, write_ulog
 from airl_mav.addons.recordings.recorded_flight import episode_of
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.arena.generate import generate
@@ -33,6 +33,7 @@ from airl_mav.latency.stamps import STAMPS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
+from firmware_sim.addons.flight_log.topics import TOPICS
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.lenses import angles
@@ -417,11 +418,12 @@ def test_body_rates_and_attitudes_have_px4s_topics(tmp_path: Path) -> None:
     scenario = Scenario(policy=policy, arena="no-obstacles", level="lockstep", tlogs=True)
     rehearse(scenario, out=tmp_path / "run")
     flight = recorded(tmp_path / "run")
-    rows: dict[str, list[tuple[float, ...]]] = {}
-    for time_us, topic, values in samples(flight):
-        rows.setdefault(topic, []).append((time_us, *values))
+    rows = {topic: (times_us, values) for topic, times_us, values in samples(flight)}
     assert "trajectory_setpoint" not in rows and "vehicle_attitude_setpoint" not in rows
-    made = np.array(rows["vehicle_rates_setpoint"])
+    times_us, values = rows["vehicle_rates_setpoint"]
+    made = np.column_stack(
+        [times_us, *(values[name] for name in ("roll", "pitch", "yaw", "thrust_body"))]
+    )
     own = ULog(str(tmp_path / "run" / "flight-000.ulg")).get_dataset("vehicle_rates_setpoint").data
     # They are followed after half a second; later both are the newest, one tick apart at most.
     later = made[made[:, 0] > made[0, 0] + 600_000]
@@ -438,15 +440,16 @@ def test_body_rates_and_attitudes_have_px4s_topics(tmp_path: Path) -> None:
     stamps = dict(flight.replayed.stamps)
     stamps["attitude_setpoint"] = stamps.pop("rates_setpoint")
     leaning = replace(flight, replayed=replace(flight.replayed, stamps=stamps))
-    told = [each for each in samples(leaning) if each[1] == "vehicle_attitude_setpoint"]
-    assert len(told) > 100
-    sent = np.searchsorted(stamps["sent_us"], [each[0] for each in told], side="right") - 1
+    ((times_us, values),) = (
+        each[1:] for each in samples(leaning) if each[0] == "vehicle_attitude_setpoint"
+    )
+    assert len(times_us) > 100
+    sent = np.searchsorted(stamps["sent_us"], times_us, side="right") - 1
     roll, pitch, yaw, thrust = stamps["attitude_setpoint"][sent].astype(float).T
     turned = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
-    turns = np.array([each[2] for each in told], float)
-    apart = Rotation.from_quat(turns[:, 1:5], scalar_first=True) * turned.inv()
+    apart = Rotation.from_quat(values["q_d"], scalar_first=True) * turned.inv()
     assert apart.magnitude().max() < 1e-6
-    np.testing.assert_allclose(turns[:, 7], -thrust)
+    np.testing.assert_allclose(values["thrust_body"][:, 2], -thrust)
 
 
 def test_the_vehicles_own_log_is_taken_where_there_is_one(lockstep: Path, tmp_path: Path) -> None:
@@ -484,16 +487,17 @@ def test_a_flight_without_truth_has_no_groundtruth(gym: Path) -> None:
         flight, info=replace(flight.info, setup=replace(flight.info.setup, level="flight"))
     )
     assert outside.truth is None
-    topics = {topic for _, topic, _ in samples(outside)}
+    topics = {topic for topic, _, _ in samples(outside)}
     assert "vehicle_local_position" in topics
     assert not [name for name in topics if name.endswith("groundtruth") or "battery" in name]
 
 
 def test_a_row_knows_its_fields() -> None:
-    with pytest.raises(KeyError, match="altitude"):
-        row("vehicle_attitude", altitude=3.0)
-    with pytest.raises(ValueError, match=r"vehicle_attitude\.q: 3 values, not 4"):
-        row("vehicle_attitude", q=[1.0, 0.0, 0.0])
+    (attitude,) = (each.topic for each in TOPICS if each.topic.name == "vehicle_attitude")
+    with pytest.raises(ValueError, match="altitude"):
+        attitude.rows([1, 2], {"altitude": 3.0})
+    with pytest.raises(ValueError, match="shape"):
+        attitude.rows([1], {"q": [1.0, 0.0, 0.0]})
 
 
 # --- live

@@ -7,8 +7,8 @@ tested without an estimator, a controller or a plant.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -37,12 +37,14 @@ from firmware_sim.autopilot.autopilot_state import (
     Wire,
 )
 from firmware_sim.autopilot.events.definition import MavlinkEvent
+from firmware_sim.autopilot.failsafes.failsafe_conditions import Conditions
 from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.modes.interface import (
     FollowedTarget,
     LandingTarget,
     ModeRequest,
     ObstacleBins,
+    OffboardSetpoint,
     Source,
     Sticks,
 )
@@ -111,6 +113,10 @@ class KnownState(NamedTuple):
     esc_outputs: tuple[float, float, float, float] | None = None
     readings: Mapping[str, Received] = MappingProxyType({})
     clearance: Clearance | None = None
+    conditions: Conditions = Conditions()
+    offboard: OffboardSetpoint | None = None
+    offboard_us: int | None = None
+    mixing: tuple[float, float] = (math.sqrt(0.5), math.sqrt(0.5))
     revision: None = None
 
 
@@ -157,8 +163,12 @@ class Parameters:
             self.history.append((name, before, self.values[name]))
         return self.by_name(name)
 
-    def reset(self) -> None:
-        self.values = dict(sorted(DEFAULT_PARAMETERS.items()))
+    def reset(self, names: Iterable[str] | None = None) -> None:
+        for name in DEFAULT_PARAMETERS if names is None else names:
+            self.set(name, DEFAULT_PARAMETERS[name])
+
+    def changed(self) -> dict[str, int | float]:
+        return {n: v for n, v in self.values.items() if v != DEFAULT_PARAMETERS.get(n)}
 
     def load(self) -> bool:
         return True
@@ -209,6 +219,7 @@ class KinematicAutopilot(BuiltinAutopilot):
         self.wires: list[Wire] = []
         self.refusals: list[tuple[str, int]] = []
         self.messages: list[OperatorText] = []
+        self.said: deque[OperatorText] = deque()
         self.events: list[MavlinkEvent] = []
         self.offboard_loss_us = US_PER_S
         self.frozen = False

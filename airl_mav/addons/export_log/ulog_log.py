@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
@@ -18,22 +17,11 @@ from airl_mav.flight.trajectory import Trajectory, commanded_velocity
 from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
 from airl_mav.profiles.px4_release import px4_release
 from firmware_sim.addons.flight_log.flight_log import described
-from firmware_sim.addons.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
-from firmware_sim.addons.flight_log.ulog_writer import Topic, UlogWriter, Values
+from firmware_sim.addons.flight_log.topics import ARMED, DISARMED, TOPICS
+from firmware_sim.addons.flight_log.ulog_writer import UlogWriter
 from firmware_sim.autopilot.flight_modes import Mode
 
 _LOGGED = {logged.topic.name: logged for logged in TOPICS}
-
-TRAJECTORY_SETPOINT = Topic(
-    "trajectory_setpoint",
-    (
-        *("float[3] position", "float[3] velocity", "float[3] acceleration", "float[3] jerk"),
-        *("float yaw", "float yawspeed"),
-    ),
-)
-"""Setpoint of the companion; PX4 logs it every 200 ms."""
-
-SETPOINT_US = 200_000
 
 NAMES = (
     "vehicle_attitude",
@@ -41,6 +29,7 @@ NAMES = (
     "vehicle_local_position",
     "vehicle_local_position_groundtruth",
     "vehicle_local_position_setpoint",
+    "trajectory_setpoint",
     "vehicle_attitude_setpoint",
     "vehicle_rates_setpoint",
     "battery_status",
@@ -49,27 +38,27 @@ NAMES = (
     "vehicle_land_detected",
 )
 
-EXPORTED = (*(_LOGGED[name].topic for name in NAMES), TRAJECTORY_SETPOINT)
+_NUMBER = {name: i for i, name in enumerate(NAMES)}
 
-_NUMBER = {topic.name: i for i, topic in enumerate(EXPORTED)}
-
-Sample = tuple[int, str, Values]
+Samples = tuple[str, NDArray[Any], Mapping[str, Any]]
+"""Topic, times (n,) [µs], and values (n, ...) by field; the others are blank."""
 
 
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
     """Write a flight as ULog; times are shifted if the path starts before time 0."""
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
-    facts = (("sys_name", "airl-mav export-log"), *described(px4_release().flight_sw_version))
-    writer = UlogWriter(path, began_us + later_us, EXPORTED, facts, ())
+    exported = [_LOGGED[name].topic for name in NAMES]
+    info = ("sys_name", "airl-mav export-log"), *described(px4_release().flight_sw_version)
+    writer = UlogWriter(path, began_us + later_us, exported, info, ())
     try:
-        texts = [(time_us, "", (severity, words)) for time_us, severity, words in _texts(flight)]
-        rows: list[tuple[int, str, Any]] = [*samples(flight), *texts]
-        for time_us, name, values in sorted(rows, key=itemgetter(0)):
-            if name:
-                writer.sample(_NUMBER[name], time_us + later_us, _later(name, values, later_us))
-            else:
-                writer.text(time_us + later_us, *values)
+        for name, times_us, columns in samples(flight):
+            topic, shifted = _LOGGED[name].topic, times_us + later_us
+            sampled = "uint64_t timestamp_sample" in topic.fields
+            known = {**columns, "timestamp_sample": shifted} if sampled else columns
+            writer.samples(_NUMBER[name], topic.rows(shifted, known))
+        for time_us, severity, words in sorted(_texts(flight), key=itemgetter(0)):
+            writer.text(time_us + later_us, severity, words)
         writer.flush()
         if writer.failure is not None:
             raise OSError(writer.failure.errno, writer.failure.strerror, str(path))
@@ -79,14 +68,7 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
         raise
 
 
-def _later(topic: str, values: Values, later_us: int) -> Values:
-    """Return a topic's values with its `timestamp_sample`, if any, shifted by `later_us` [µs]."""
-    if not later_us or "uint64_t timestamp_sample" not in EXPORTED[_NUMBER[topic]].fields[:1]:
-        return values
-    return (values[0] + later_us, *values[1:])
-
-
-def samples(flight: RecordedFlight) -> Iterator[Sample]:
+def samples(flight: RecordedFlight) -> Iterator[Samples]:
     """Yield the samples to be logged, topic by topic."""
     path, truth = flight.replayed.path, flight.truth
     yield from _motion(flight.believed, "")
@@ -97,133 +79,97 @@ def samples(flight: RecordedFlight) -> Iterator[Sample]:
     yield from _states(flight, path)
 
 
-def row(topic: str, **known: Any) -> Values:
-    """Return a topic's field values with defaults for missing ones; check names and lengths."""
-    values: list[float | int | bool] = []
-    for field in EXPORTED[_NUMBER[topic]].fields:
-        kind, name = field.split()
-        base, _, count = kind.rstrip("]").partition("[")
-        length = int(count or 1)
-        unknown = math.nan if base in ("float", "double") else False if base == "bool" else 0
-        given = known.pop(name, [unknown] * length)
-        part = np.atleast_1d(given).tolist()
-        if len(part) != length:
-            raise ValueError(f"{topic}.{name}: {len(part)} values, not {length}")
-        values += part
-    if known:
-        raise KeyError(f"{topic}: {', '.join(known)}")
-    return tuple(values)
-
-
-def _every(path: Trajectory, interval_us: int) -> list[int]:
-    """Return the row numbers of path samples at least `interval_us` apart [µs]."""
+def _every(path: Trajectory, topic: str) -> list[int]:
+    """Return the row numbers of path samples at least the interval of a topic apart."""
     kept, due_us = [], int(path.time_us[0])
     for i, time_us in enumerate(path.time_us.tolist()):
         if time_us >= due_us:
             kept.append(i)
-            due_us = time_us + interval_us
+            due_us = time_us + _LOGGED[topic].interval_us
     return kept
 
 
-def _motion(path: Trajectory, suffix: str) -> Iterator[Sample]:
+def _motion(path: Trajectory, suffix: str) -> Iterator[Samples]:
     """Yield attitude, position and velocity, NED; `suffix` is appended to the topic names."""
     attitude, position = f"vehicle_attitude{suffix}", f"vehicle_local_position{suffix}"
-    for i in _every(path, _LOGGED[attitude].interval_us):
-        time_us = int(path.time_us[i])
-        yield time_us, attitude, row(attitude, timestamp_sample=time_us, q=path.quaternion[i])
-    headings = quats_to_euler(path.quaternion)[2]
+    kept = _every(path, attitude)
+    yield attitude, path.time_us[kept], {"q": path.quaternion[kept]}
+    kept = _every(path, position)
+    columns = np.column_stack([path.position[kept], path.velocity[kept]]).T
+    known = dict(zip(("x", "y", "z", "vx", "vy", "vz"), columns, strict=True))
+    known["z_deriv"], known["heading"] = columns[5], quats_to_euler(path.quaternion[kept])[2]
     valid = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
-    for i in _every(path, _LOGGED[position].interval_us):
-        time_us = int(path.time_us[i])
-        places = dict(zip(("x", "y", "z"), path.position[i].tolist(), strict=True))
-        speeds = dict(zip(("vx", "vy", "vz"), path.velocity[i].tolist(), strict=True))
-        known = {**places, **speeds, "z_deriv": speeds["vz"], "heading": headings[i], **valid}
-        yield time_us, position, row(position, timestamp_sample=time_us, **known)
+    yield position, path.time_us[kept], {**known, **valid}
 
 
-def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
+def _setpoints(flight: RecordedFlight) -> Iterator[Samples]:
     columns = flight.decisions
     if len(columns.get(SETPOINT, ())):
         yield from _velocity_setpoints(flight, columns)
-    if len(columns.get(ATTITUDE, ())):
-        name = "vehicle_attitude_setpoint"
-        for time_us, newest in _commanded(flight, _LOGGED[name].interval_us):
-            *angles, thrust = columns[ATTITUDE][newest].tolist()
-            q_d = quat_from_euler(*angles)
-            yield time_us, name, row(name, q_d=q_d, thrust_body=(0.0, 0.0, -thrust))
-    if len(columns.get(RATES, ())):
-        name = "vehicle_rates_setpoint"
-        for time_us, newest in _commanded(flight, _LOGGED[name].interval_us):
-            *rates, thrust = columns[RATES][newest].tolist()
-            turns = dict(zip(("roll", "pitch", "yaw"), rates, strict=True))
-            yield time_us, name, row(name, **turns, thrust_body=(0.0, 0.0, -thrust))
+    for name, column in (
+        ("vehicle_attitude_setpoint", ATTITUDE),
+        ("vehicle_rates_setpoint", RATES),
+    ):
+        if not len(columns.get(column, ())):
+            continue
+        times_us, newest = _commanded(flight, name)
+        *angles, thrust = columns[column][newest].astype(float).T
+        known: dict[str, Any] = dict(zip(("roll", "pitch", "yaw"), angles, strict=True))
+        if column == ATTITUDE:
+            turns = [quat_from_euler(*each) for each in zip(*angles, strict=True)]
+            known = {"q_d": np.reshape(turns, (-1, 4))}
+        yield name, times_us, {**known, "thrust_body": np.outer(thrust, (0.0, 0.0, -1.0))}
 
 
 def _velocity_setpoints(
     flight: RecordedFlight, columns: Mapping[str, NDArray[Any]]
-) -> Iterator[Sample]:
+) -> Iterator[Samples]:
     path = flight.replayed.path
     velocities = commanded_velocity(path, columns, path.time_us)
-    tracked, commanded = "vehicle_local_position_setpoint", TRAJECTORY_SETPOINT.name
-    for name, interval_us in ((tracked, _LOGGED[tracked].interval_us), (commanded, SETPOINT_US)):
-        for time_us, newest in _commanded(flight, interval_us):
-            velocity = velocities[np.searchsorted(path.time_us, time_us)].tolist()
-            speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))
-            values = speeds if name == tracked else {"velocity": velocity}
-            turn = float(columns[SETPOINT][newest, 3])
-            yield time_us, name, row(name, **values, yawspeed=turn)
+    for name in ("vehicle_local_position_setpoint", "trajectory_setpoint"):
+        times_us, newest = _commanded(flight, name)
+        velocity = velocities[np.searchsorted(path.time_us, times_us)]
+        values = dict(zip(("vx", "vy", "vz"), velocity.T, strict=True))
+        if name == "trajectory_setpoint":
+            values = {"velocity": velocity}
+        yield name, times_us, {**values, "yawspeed": columns[SETPOINT][newest, 3]}
 
 
-def _commanded(flight: RecordedFlight, interval_us: int) -> Iterator[tuple[int, int]]:
-    """Yield path times [µs] during navigation with the number of the newest decision."""
+def _commanded(flight: RecordedFlight, topic: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return path times [µs] during navigation with the numbers of the newest decisions."""
     path = flight.replayed.path
-    which = np.searchsorted(flight.decisions["sent_us"], path.time_us, side="right") - 1
-    for i in _every(path, interval_us):
-        time_us = int(path.time_us[i])
-        if which[i] >= 0 and flight.replayed.record.navigates(time_us):
-            yield time_us, int(which[i])
+    times_us = path.time_us[_every(path, topic)]
+    newest = np.searchsorted(flight.decisions["sent_us"], times_us, side="right") - 1
+    navigates = [flight.replayed.record.navigates(each) for each in times_us.tolist()]
+    known = (newest >= 0) & np.array(navigates, bool)
+    return times_us[known], newest[known]
 
 
-def _battery(flight: RecordedFlight) -> Iterator[Sample]:
+def _battery(flight: RecordedFlight) -> Iterator[Samples]:
     charge, path, name = charge_of(flight), flight.replayed.path, "battery_status"
-    if charge is None:
-        return
-    for i in _every(path, _LOGGED[name].interval_us):
-        values = row(
-            name,
-            voltage_v=charge.voltage_v[i],
-            current_a=charge.current_a[i],
-            discharged_mah=charge.discharged_mah[i],
-            remaining=charge.remaining[i],
-            scale=1.0,
-            connected=True,
-            id=1,
-        )
-        yield int(path.time_us[i]), name, values
+    if charge is not None:
+        kept = _every(path, name)
+        yield name, path.time_us[kept], {key: each[kept] for key, each in vars(charge).items()}
 
 
-def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
+def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Samples]:
     """Yield mode, arming and landed state on every change and every half second."""
-    last, due_us = None, 0
+    last, due_us, rows = None, 0, []
     for time_us, position in zip(path.time_us.tolist(), path.position, strict=True):
         navigates = flight.replayed.record.navigates(time_us)
         flies = navigates or -float(position[2]) > STANDING_M
         if (navigates, flies) == last and time_us < due_us:
             continue
-        last, due_us = (navigates, flies), time_us + ON_CHANGE_US
-        mode = (Mode.OFFBOARD if navigates else Mode.HOLD).spec.state
-        status = row(
-            "vehicle_status",
-            arming_state=ARMED if flies else DISARMED,
-            nav_state_user_intention=mode,
-            nav_state=mode,
-            vehicle_type=ROTARY_WING,
-            pre_flight_checks_pass=True,
-        )
-        landed = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), not flies)
-        yield time_us, "vehicle_status", status
-        yield time_us, "actuator_armed", row("actuator_armed", armed=flies, ready_to_arm=True)
-        yield time_us, "vehicle_land_detected", row("vehicle_land_detected", **landed)
+        last, due_us = (navigates, flies), time_us + _LOGGED["vehicle_status"].interval_us
+        rows.append((time_us, navigates, flies))
+    times_us, navigating, flying = np.array(rows, np.int64).reshape(-1, 3).T
+    mode = np.where(navigating, Mode.OFFBOARD.spec.state, Mode.HOLD.spec.state)
+    status = {"nav_state_user_intention": mode, "nav_state": mode, "pre_flight_checks_pass": True}
+    status["arming_state"] = np.where(flying, ARMED, DISARMED)
+    landed = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), 1 - flying)
+    yield "vehicle_status", times_us, status
+    yield "actuator_armed", times_us, {"armed": flying, "ready_to_arm": True}
+    yield "vehicle_land_detected", times_us, landed
 
 
 def _texts(flight: RecordedFlight) -> Iterator[tuple[int, int, str]]:

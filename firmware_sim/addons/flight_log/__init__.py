@@ -8,3 +8,4 @@ Guide: docs/reference/run-folder.md.
 """
 
 FLIGHT_LOGS = {"ulog": "firmware_sim.addons.flight_log.flight_log:open_flight_log"}
+TOPICS = {"uorb": "firmware_sim.addons.flight_log.topics"}

@@ -5,84 +5,23 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import BinaryIO
 
-from airl_mav.core import constants, frames
+import numpy as np
+
+from airl_mav import __version__
+from airl_mav.core import constants
 from firmware_sim import interfaces
 from firmware_sim.addons.flight_log import topics, ulog_writer
-from firmware_sim.autopilot import autopilot_state, parameter_store, snapshot
-from firmware_sim.autopilot import error_state as es
-from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.engine.dynamics import POSITION, QUATERNION, RATES, VELOCITY
-from firmware_sim.engine.record import Record
+from firmware_sim.autopilot import autopilot, autopilot_state, parameter_store, snapshot
+from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
+from firmware_sim.mavlink.streams import status
 
-# ruff: noqa: D102 (`AutopilotState` documents the properties of `FlownState`)
+POLL_US = 5 * constants.TICK_US
+"""Interval of checks for due topics of the newest state [µs]."""
 
-
-def truth_of(tick: Any) -> interfaces.TrueState:
-    """Return the true state of a tick of an aircraft (`engine.record.TRUE_TICK`)."""
-    row = tick["motion"].copy()
-    power_w, charge = float(tick["power_w"]), float(tick["charge"])
-    parts = row[POSITION], row[VELOCITY], row[QUATERNION], row[RATES]
-    return interfaces.TrueState(int(tick["time_us"]), *parts, power_w, charge)
-
-
-class FlownState:
-    """Autopilot state of one tick, from the log of the tick. Implements `AutopilotState`.
-
-    Status, home and parameters are not in the log: they are from the end of the ticks.
-    """
-
-    def __init__(self, state: snapshot.AutopilotState, tick: Any) -> None:
-        """Combine the state after all ticks with one tick's log (`engine.record.FLOWN_TICK`)."""
-        self._state, self._tick = state, tick
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._state, name)
-
-    @property
-    def time_us(self) -> int:
-        return int(self._tick["time_us"])
-
-    @property
-    def estimate(self) -> autopilot_state.StateEstimate:
-        row: frames.Vector = self._tick["state"].copy()
-        return autopilot_state.StateEstimate(
-            self.time_us,
-            row[es.P : es.V],
-            row[es.V : es.Q],
-            row[es.ACCELERATION : es.SIGMA],
-            row[es.Q : es.RATES],
-            row[es.RATES : es.GYRO_BIAS],
-            row[es.GYRO_BIAS : es.ACCEL_BIAS],
-            row[es.ACCEL_BIAS : es.BARO_OFFSET],
-            row[es.SIGMA : es.RATIO],
-            row[es.RATIO :],
-            bool(self._tick["healthy"]),
-        )
-
-    @property
-    def setpoint(self) -> autopilot_state.Setpoint:
-        return snapshot.setpoint_of(self._tick, self._output(7, 10))
-
-    attitude_setpoint = property(lambda self: self._output(0, 4))
-    rate_setpoint = property(lambda self: self._output(4, 7))
-    thrust_setpoint = property(lambda self: self._tick["output"].item(10))
-    accel = property(lambda self: self._tick["accel"].copy())
-    gyro = property(lambda self: self._tick["gyro"].copy())
-    mag = property(lambda self: self._tick["mag"].copy())
-    pressure_hpa = property(lambda self: self._tick["pressure_hpa"].item())
-    temperature_c = property(lambda self: self._tick["temperature_c"].item())
-    motors = property(lambda self: tuple(self._tick["motors"].tolist()))
-    battery = property(lambda self: interfaces.BatterySample(*self._tick["battery"].tolist()))
-
-    def _output(self, first: int, end: int) -> frames.Vector:
-        values: frames.Vector = self._tick["output"][first:end].copy()
-        return values
-
-
-GRID_US = 5 * constants.TICK_US
-"""Interval of checks for due topics [µs]; all topic intervals are multiples of it."""
+BUFFERED = constants.TICK_HZ
+"""Maximum number of ticks before they are logged."""
 
 _DATA_FORMAT = 2
 """ver_data_format: selects the field names in Flight Review, the same for PX4 1.16 to 1.18."""
@@ -91,14 +30,14 @@ _DATA_FORMAT = 2
 def described(flight_sw_version: int) -> tuple[tuple[str, str | int], ...]:
     """Return vehicle information by ULog key, in addition to the name."""
     return (
-        ("ver_hw", "PX4_SITL"),
+        ("ver_sw", f"airl-mav {__version__}"),
+        ("ver_sw_branch", "built-in"),
         ("ver_sw_release", flight_sw_version),
+        ("ver_hw", "PX4_SITL"),
         ("ver_data_format", _DATA_FORMAT),
+        ("sys_uuid", f"{status.UID:036x}"),
+        ("int32_t time_ref_utc", 0),
     )
-
-
-_SAMPLES = 0
-"""Number of `SENSOR_COMBINED` in the file, before the topics of `TOPICS` in order."""
 
 
 class UlogFlightLog:
@@ -121,9 +60,17 @@ class UlogFlightLog:
         self.began_unix_us = boot_unix_us + start_us
         """Calendar time of the start of the log [µs since 1970]."""
         self._due_us = [start_us] * len(topics.TOPICS)
-        self._last: list[ulog_writer.Values | None] = [None] * len(topics.TOPICS)
-        self._truth: Any = None
-        """True state after the newest tick (`engine.record.TRUE_TICK`)."""
+        self._poll_us = start_us
+        self._last: dict[int, bytes] = {}
+        """Newest message of each topic of the state, without its timestamp."""
+        self._flown, self._truths = (np.zeros(BUFFERED, kind) for kind in (FLOWN_TICK, TRUE_TICK))
+        """Ticks to be logged."""
+        self._count = 0
+        """Number of ticks to be logged."""
+        self._state: snapshot.AutopilotState | None = None
+        """State after the newest tick."""
+        self._seen: tuple[object, object] = None, None
+        """Revision and status at the newest look at the state."""
         self._parameters = parameters
         self._known = dict(_values(parameters))
         self.folder = LogFolder(path.parent, self)
@@ -133,7 +80,7 @@ class UlogFlightLog:
         self.writer = ulog_writer.UlogWriter(
             path,
             start_us,
-            (topics.SENSOR_COMBINED, *(logged.topic for logged in topics.TOPICS)),
+            [logged.topic for logged in topics.TOPICS],
             (("sys_name", "airl-mav"), *described(parameters.release.flight_sw_version)),
             self._known.items(),
             on_lost,
@@ -143,23 +90,28 @@ class UlogFlightLog:
         """Log the due topics of n ticks, from their logs and the final autopilot state."""
         if self.writer.lost or self.writer.closed:
             return
-        rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))
-        for k, (time_us, gyro, accel) in enumerate(zip(*rows, strict=True)):
-            self.writer.sample(_SAMPLES, time_us, topics.sensor_combined(gyro, accel))
-            truth = truths[k - 1] if k else self._truth
-            if time_us % GRID_US == 0 and truth is not None:
-                logged = cast(snapshot.AutopilotState, FlownState(state, flown[k]))
-                moment = topics.Moment(logged, truth_of(truth), self._boot_unix_us + time_us)
-                self._log(moment, time_us)
-        self._truth = truths[-1].copy()
+        status, end = state.status, self._count + len(flown)
+        if end > BUFFERED or (self._state is not None and self._state.status is not status):
+            self._log_ticks()
+            end = len(flown)
+        self._flown[self._count : end], self._truths[self._count : end] = flown, truths
+        self._count, self._state = end, state
+        revision, seen = state.revision, self._seen
+        changed = status is not seen[1] or (revision is not None and revision is not seen[0])
+        if changed or state.time_us >= self._poll_us:
+            self._seen = revision, status
+            # A state without a revision may have changed.
+            self._log_state(state, changed=changed or revision is None)
 
     def text(self, message: autopilot_state.OperatorText, time_us: int) -> None:
         """Log an operator text."""
         if not self.writer.closed:
+            self._log_ticks()
             self.writer.text(time_us, message.severity, message.text)
 
     def parameters_changed(self) -> None:
         """Log the parameters with changed values."""
+        self._log_ticks()
         for name, value in _values(self._parameters):
             if self._known[name] != value:
                 self._known[name] = value
@@ -169,6 +121,8 @@ class UlogFlightLog:
         """Complete the log and rename it to the final name. Idempotent."""
         self.stop_listening()
         self.stop_listening = lambda: None
+        if not self.writer.closed:
+            self._log_ticks()
         self.writer.close()
 
     def discard(self) -> None:
@@ -176,18 +130,48 @@ class UlogFlightLog:
         self.close()
         self.folder.close()
 
-    def _log(self, moment: topics.Moment, now_us: int) -> None:
-        due_us, last = self._due_us, self._last
-        for i, logged in enumerate(topics.TOPICS):
-            due = now_us >= due_us[i]
-            if not due and not logged.on_change:
-                continue
-            values = logged.values(moment)
-            if values is None or (not due and values == last[i]):
-                continue
-            last[i] = values
-            due_us[i] = now_us + logged.interval_us
-            self.writer.sample(1 + i, now_us, values)
+    def command(self, values: ulog_writer.Values, time_us: int) -> None:
+        """Log a command of a client as vehicle_command."""
+        if not self.writer.closed:
+            number = next(i for i, each in enumerate(topics.TOPICS) if each.rows == "event")
+            self.writer.sample(number, time_us, values)
+
+    def _log_ticks(self) -> None:
+        """Log the buffered ticks."""
+        count, self._count = self._count, 0
+        if count == 0 or self._state is None:
+            return
+        flown, truths = self._flown[:count], self._truths[:count]
+        for number, logged in enumerate(topics.TOPICS):
+            if logged.rows in ("flown", "truth"):
+                due, true = (
+                    each[each["time_us"] % logged.interval_us == 0] for each in (flown, truths)
+                )
+                self._log(number, topics.Moment(due, true, self._state, self._boot_unix_us))
+
+    def _log_state(self, state: snapshot.AutopilotState, *, changed: bool) -> None:
+        """Log the topics of the newest state that are due or have changed."""
+        now_us, newest = state.time_us, slice(self._count - 1, self._count)
+        moment = topics.Moment(self._flown[newest], self._truths[newest], state, self._boot_unix_us)
+        self._poll_us = now_us + POLL_US
+        for number, logged in enumerate(topics.TOPICS):
+            due = now_us >= self._due_us[number]
+            if logged.rows == "state" and (due or (changed and logged.changes)):
+                self._log(number, moment, again=due and not logged.time)
+
+    def _log(self, number: int, moment: topics.Moment, *, again: bool = True) -> None:
+        """Log the messages of a topic; unless `again`, only if they differ from the last one."""
+        logged = topics.TOPICS[number]
+        rows = logged.messages(moment)
+        if rows is None:
+            return
+        if logged.rows == "state":
+            content = rows.tobytes()[0 if logged.time else ulog_writer.HEAD_BYTES :]
+            if content == self._last.get(number) and not again:
+                return
+            self._last[number] = content
+            self._due_us[number] = moment.state.time_us + logged.interval_us
+        self.writer.samples(number, rows)
 
 
 def _values(parameters: parameter_store.Parameters) -> Iterable[tuple[str, int | float]]:
@@ -247,6 +231,10 @@ class LogFolder(interfaces.LogStore):
             return None
         return interfaces.OpenLog(len(self._completed()), log.head_bytes, log.size_bytes)
 
+    def command(self, values: tuple[float, ...], time_us: int) -> None:
+        """Log a command of a client."""
+        self._current.command(values, time_us)
+
     def close(self) -> None:
         """Close all files open for downloads. Idempotent."""
         while self._files:
@@ -280,13 +268,13 @@ def _entry(path: Path) -> interfaces.LogEntry:
 
 def open_flight_log(
     path: Path,
-    autopilot: BuiltinAutopilot,
+    port: autopilot.BuiltinAutopilot,
     start_us: int,
     boot_unix_us: int,
     on_lost: Callable[[str], None],
 ) -> UlogFlightLog:
     """Open the flight log of an autopilot, which offers it to clients; see `UlogFlightLog`."""
-    log = UlogFlightLog(path, autopilot.parameters, start_us, boot_unix_us, on_lost)
-    log.stop_listening = autopilot.parameters.on_change(log.parameters_changed)
-    autopilot.logs = log.folder
+    log = UlogFlightLog(path, port.parameters, start_us, boot_unix_us, on_lost)
+    log.stop_listening = port.parameters.on_change(log.parameters_changed)
+    port.logs = log.folder
     return log

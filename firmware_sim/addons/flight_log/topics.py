@@ -1,386 +1,300 @@
-"""Logged uORB topics of PX4 1.16, with PX4's names, units and intervals.
+"""Logged uORB topics of PX4 1.17 (`topics.toml`), and the sources of their values.
 
 A topic contains the PX4 fields that apply to the simulator; logs are self-describing, so readers
-find fields by name. Intervals: PX4's default profile (SDLOG_PROFILE), src/modules/logger.
+find fields by name. Sources are arrays: one call logs many ticks.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.control import demand, loops
 from airl_mav.core import constants, frames
+from airl_mav.profiles.loading import read_table
 from airl_mav.vehicle import atmosphere
-from firmware_sim import interfaces, sensor_table
+from firmware_sim import sensor_table
 from firmware_sim.addons.flight_log.ulog_writer import Topic, Values
-from firmware_sim.autopilot import autopilot_state, snapshot
+from firmware_sim.autopilot import autopilot_state, error_state, flight_modes, snapshot
+from firmware_sim.engine import dynamics, record
 
-ON_CHANGE_US = 500 * constants.US_PER_MS
-"""Maximum interval of topics that are logged on change [µs]."""
+Rows: TypeAlias = NDArray[Any]
 
 DISARMED, ARMED = 1, 2
 """VehicleStatus.arming_state."""
 
-ROTARY_WING = 1
-"""VehicleStatus.vehicle_type."""
+_MOTORS, _OUTPUTS = 12, 16
+"""ActuatorMotors.NUM_CONTROLS, ActuatorOutputs.NUM_ACTUATOR_OUTPUTS; absent motors are NaN."""
 
-DIST_BOTTOM_SENSOR_RANGE = 1
-"""VehicleLocalPosition.dist_bottom_sensor_bitfield."""
+_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900.0, 1_000.0, 1_000.0
+"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
 
-MOTORS = 12
-"""ActuatorMotors.NUM_CONTROLS; absent motors are NaN."""
-
-_UNUSED_MOTORS = (math.nan,) * (MOTORS - 4)
-_NO_VECTOR = (math.nan, math.nan, math.nan)
-_UNKNOWN = math.nan
+_SETPOINT_TYPES = {"HOLD": 2, "TAKEOFF": 3, "LAND": 4}
+"""PositionSetpoint.type by mode; 0 in other modes."""
 
 
 class Moment(NamedTuple):
-    """State of a vehicle and its simulator after a tick."""
+    """State of a vehicle and its simulator after some ticks."""
 
+    flown: record.Record
+    """(n,) logs of the flight controller's ticks."""
+    truths: record.Record
+    """(n,) logs of the aircraft's ticks."""
     state: snapshot.AutopilotState
-    truth: interfaces.TrueState
-    unix_us: int
-    """Calendar time [µs since 1970]."""
+    boot_unix_us: int = 0
+    """Calendar time of simulated time 0 [µs since 1970]."""
+
+
+Source: TypeAlias = Callable[[Moment], Any]
+"""Returns an array (n, ...), or a value of all ticks."""
+
+
+def _part(column: str, part: slice) -> Source:
+    return lambda m: m.flown[column][:, part]
+
+
+def _places(positions: frames.Vector, origin: frames.Geodetic | None) -> Any:
+    """Return latitudes, longitudes [deg] and altitudes [m] (n, 3) of local positions NED."""
+    if origin is None:
+        return np.full((len(positions), 3), math.nan)
+    return np.array([frames.local_to_geodetic(each, origin) for each in positions]).reshape(-1, 3)
+
+
+def _is_placed(m: Moment) -> Any:
+    """Return a mask (n,) of ticks with a position setpoint."""
+    return np.isin(m.flown["demand_kind"], (record.POSITION, record.TRAJECTORY))
+
+
+def _trajectory(m: Moment) -> Rows:
+    """Return position, velocity, acceleration, yaw and yaw rate setpoints (n, 11), NED."""
+    wanted, plain = m.flown["demand"], m.flown["demand_kind"] == record.POSITION
+    found = wanted.copy()
+    # The two layouts of `demand` hold yaw and yaw rate at different places.
+    found[plain, 6:9], found[plain, 9:] = math.nan, wanted[plain, 6:8]
+    # A position without a velocity has zero there; PX4 logs NaN.
+    speeds = found[:, 3:6]
+    speeds[np.isfinite(found[:, :3]) & (speeds == 0.0)] = math.nan
+    return found
+
+
+def _ground(m: Moment) -> Any:
+    """Return distance to the ground [m], variance [m²], validity, resets, and 1 for a sensor."""
+    ground = m.state.clearance
+    if ground is None:
+        return np.array((math.nan, math.nan, 0.0, 0.0, 0.0))
+    found = ground.dist_bottom_m, ground.variance_m2, ground.valid, ground.resets % 256
+    return np.array((*found, ground.by_range), np.float64)
+
+
+def _motors(m: Moment, count: int, stopped: float, commands: Rows) -> Rows:
+    """Return `commands` (n, 4) in `count` columns; `stopped` while disarmed, and in the others."""
+    found = np.full((len(m.flown), count), stopped)
+    if _is_armed(m):
+        found[:, :4] = commands
+    return found
+
+
+def _torque(m: Moment) -> Any:
+    """Return the torque setpoint (n, 3) that the motor commands contain, -1..1, FRD."""
+    directions = np.array((loops.ROLL, loops.PITCH, loops.YAW)).T
+    return m.flown["motors"] @ (directions / (4.0 * np.array((*m.state.mixing, 1.0))))
+
+
+def _offboard(m: Moment) -> Any:
+    """Return the flags of the newest offboard setpoint (5,), as in offboard_control_mode."""
+    newest = m.state.offboard
+    kinds = isinstance(newest, demand.AttitudeDemand), isinstance(newest, demand.RateDemand)
+    vectors = (
+        (newest.position, newest.velocity, newest.acceleration)
+        if isinstance(newest, autopilot_state.Setpoint)
+        else ((math.nan,),) * 3
+    )
+    return np.array([*(bool(np.isfinite(each).any()) for each in vectors), *kinds])
+
+
+def _destination(m: Moment) -> Mapping[str, Any]:
+    """Return the current setpoint of position_setpoint_triplet."""
+    ((latitude, longitude, altitude),) = _places(np.array([m.state.destination]), m.state.origin)
+    kind, now_us = _SETPOINT_TYPES.get(m.state.status.mode.name, 0), m.state.time_us
+    place = {"lat": latitude, "lon": longitude, "alt": altitude}
+    return {"timestamp": now_us, "valid": True, "type": kind, **place}
+
+
+def _is_armed(m: Moment) -> bool:
+    return m.state.status.arming is autopilot_state.Arming.ARMED
+
+
+def _thrust(m: Moment) -> Any:
+    """Return the thrust setpoint (n, 3), body -1..0."""
+    return m.flown["output"][:, 10:] * (0.0, 0.0, -1.0)
+
+
+_SIGMA = error_state.SIGMA
+
+SOURCES: Mapping[str, Source] = {
+    "position": _part("state", slice(error_state.P, error_state.V)),
+    "velocity": _part("state", slice(error_state.V, error_state.Q)),
+    "q": _part("state", slice(error_state.Q, error_state.RATES)),
+    "rates": _part("state", slice(error_state.RATES, error_state.GYRO_BIAS)),
+    "acceleration": _part("state", slice(error_state.ACCELERATION, error_state.ACCELERATION + 3)),
+    "specific_force": lambda m: (
+        m.flown["accel"] - m.flown["state"][:, error_state.ACCEL_BIAS : error_state.BARO_OFFSET]
+    ),
+    "test_ratios": _part("state", slice(error_state.RATIO, error_state.RATIO + 4)),
+    "velocity_ratio": lambda m: m.flown["state"][:, [error_state.RATIO, error_state.RATIO + 3]].max(
+        axis=1
+    ),
+    "heading": lambda m: frames.quats_to_euler(
+        m.flown["state"][:, error_state.Q : error_state.RATES]
+    )[2],
+    # Horizontal and vertical position, horizontal and vertical velocity.
+    "accuracy": lambda m: np.hypot(
+        m.flown["state"][:, [_SIGMA, _SIGMA + 2, _SIGMA + 3, _SIGMA + 5]],
+        m.flown["state"][:, [_SIGMA + 1, _SIGMA + 2, _SIGMA + 4, _SIGMA + 5]] * (1, 0, 1, 0),
+    ),
+    "origin": lambda m: np.array(m.state.origin or (math.nan,) * 3),
+    "located": lambda m: (m.state.origin is not None) & (m.flown["healthy"] != 0),
+    "place": lambda m: _places(m.flown["state"][:, error_state.P : error_state.V], m.state.origin),
+    "ground": _ground,
+    "q_setpoint": _part("output", slice(0, 4)),
+    "rates_setpoint": _part("output", slice(4, 7)),
+    "thrust_body": _thrust,
+    "torque": _torque,
+    "control": lambda m: _motors(m, _MOTORS, math.nan, m.flown["motors"]),
+    "pulses": lambda m: _motors(
+        m, _OUTPUTS, _PWM_DISARMED, np.rint(_PWM_MIN + _PWM_SPAN * m.flown["motors"])
+    ),
+    "has_trajectory": _is_placed,
+    "trajectory": _trajectory,
+    # Without a position setpoint, the controller's is the current position.
+    "position_setpoint": lambda m: np.where(
+        _is_placed(m)[:, None], m.flown["demand"][:, :3], m.flown["state"][:, :3]
+    ),
+    "yaw_setpoint": lambda m: np.where(
+        _is_placed(m)[:, None], _trajectory(m)[:, 9:], (math.nan, 0)
+    ),
+    "yaw_move_rate": lambda m: np.where(_is_placed(m), np.nan_to_num(_trajectory(m)[:, 10]), 0.0),
+    "offboard": _offboard,
+    "offboard_us": attrgetter("state.offboard_us"),
+    "has_destination": lambda m: m.state.destination if m.state.origin is not None else None,
+    "destination": _destination,
+    "fix_place": lambda m: _places(m.flown["gps_position"], frames.HOME),
+    "fix_speed": lambda m: np.linalg.norm(m.flown["gps_velocity"], axis=1),
+    "fix_course": lambda m: np.arctan2(
+        m.flown["gps_velocity"][:, 1], m.flown["gps_velocity"][:, 0]
+    ),
+    "unix_us": lambda m: m.boot_unix_us + m.flown["time_us"],
+    "has_pressure": lambda m: np.isfinite(m.flown["pressure_hpa"]),
+    "pressure_pa": lambda m: 100.0 * m.flown["pressure_hpa"],
+    "baro_altitude": lambda m: [atmosphere.altitude_m(p) for p in m.flown["pressure_hpa"].tolist()],
+    "arming_state": lambda m: ARMED if _is_armed(m) else DISARMED,
+    "armed": _is_armed,
+    "ready": lambda m: m.state.status.arming is not autopilot_state.Arming.BOOT,
+    "landed": lambda m: m.state.status.landed is autopilot_state.Landed.ON_GROUND,
+    "breached": lambda m: any(m.state.conditions.geofence),
+    "true_heading": lambda m: frames.quats_to_euler(m.flown["motion"][:, dynamics.QUATERNION])[2],
+}
+"""Sources of `topics.toml`. Units: SI, frames: NED and FRD."""
 
 
 @dataclass(frozen=True)
 class Logged:
-    """Logged topic: interval and function of the field values (None = nothing to log)."""
+    """Logged topic."""
 
     topic: Topic
-    interval_us: int
-    values: Callable[[Moment], Values | None]
-    on_change: bool = False
+    interval_us: int = 0
+    rows: str = "flown"
+    """Log with a row per message: flown or truth; state = the newest state; event = none."""
+    changes: bool = False
     """True to log a change immediately; otherwise only the interval applies."""
+    when: str = ""
+    """Source of a condition: None, or false in a tick = no message."""
+    time: str = ""
+    """Source of the timestamp of a state."""
+    sources: Mapping[str, str] = field(default_factory=dict)
+    """Sources by field."""
+    values: Callable[[snapshot.AutopilotState], Values | None] | None = None
+    """Function of the values in place of sources, for a topic of a sensor."""
+
+    def messages(self, moment: Moment) -> Rows | None:
+        """Return the messages of a moment (n,); None = nothing to log."""
+        if self.values is not None:
+            values = self.values(moment.state)
+            return None if values is None else self.topic.row(moment.state.time_us, values)
+        if self.rows == "truth":
+            moment = moment._replace(flown=moment.truths)
+        if self.when:
+            known = _read(self.when, moment, {})
+            if known is None:
+                return None
+            if isinstance(known, np.ndarray):
+                moment = moment._replace(flown=moment.flown[known])
+        memo: dict[str, Any] = {}
+        columns = {name: _read(source, moment, memo) for name, source in self.sources.items()}
+        times: Any = moment.flown["time_us"]
+        if self.rows == "state":
+            times = [_read(self.time, moment, memo) if self.time else moment.state.time_us]
+        return self.topic.rows(times, columns)
 
 
-def _topic(name: str, fields: str) -> Topic:
-    """Return a topic whose fields are "type name ...; type name ..."."""
-    groups = (group.split() for group in fields.split("; "))
-    return Topic(name, tuple(f"{kind} {name}" for kind, *names in groups for name in names))
+def _read(source: str, moment: Moment, memo: dict[str, Any]) -> Any:
+    """Return the value of a source; `memo` holds the values of the same moment by name."""
+    if source[0] == "@":
+        return attrgetter(source[1:])(moment.state)
+    name, _, place = source.partition(".")
+    if name not in memo:
+        memo[name] = SOURCES[name](moment) if name in SOURCES else moment.flown[name]
+    if not place:
+        return memo[name]
+    first, colon, end = place.partition(":")
+    return memo[name][..., slice(int(first), int(end)) if colon else int(first)]
 
 
-SENSOR_COMBINED = _topic(
-    "sensor_combined",
-    "float[3] gyro_rad; uint32_t gyro_integral_dt; int32_t accelerometer_timestamp_relative; "
-    "float[3] accelerometer_m_s2; uint32_t accelerometer_integral_dt; "
-    "uint8_t accelerometer_clipping gyro_clipping",
-)
-"""Topic logged at every tick; see `sensor_combined`."""
-
-TOPICS: list[Logged] = []
-"""Logged topics, in the order of definition below."""
-
-_Values = TypeVar("_Values", bound=Callable[[Moment], "Values | None"])
-
-
-def _logged(name: str, interval_ms: int | None, fields: str) -> Callable[[_Values], _Values]:
-    """Log a function's values as a topic; an interval of None = on change."""
-    interval_us = ON_CHANGE_US if interval_ms is None else interval_ms * constants.US_PER_MS
-
-    def register(values: _Values) -> _Values:
-        TOPICS.append(Logged(_topic(name, fields), interval_us, values, interval_ms is None))
-        return values
-
-    return register
-
-
-def sensor_combined(gyro: Sequence[float], accel: Sequence[float]) -> Values:
-    """Return a raw IMU sample: FRD [rad/s], [m/s²]."""
-    offset_us, clipping = 0, (0, 0)
-    return (*gyro, constants.TICK_US, offset_us, *accel, constants.TICK_US, *clipping)
-
-
-@_logged("vehicle_angular_velocity", 20, "uint64_t timestamp_sample; float[3] xyz")
-def angular_velocity(moment: Moment) -> Values:
-    """Return the estimated body rates FRD [rad/s]."""
-    estimate = moment.state.estimate
-    return estimate.time_us, *estimate.angular_velocity.tolist()
-
-
-@_logged("vehicle_rates_setpoint", 20, "float roll pitch yaw; float[3] thrust_body")
-def rates_setpoint(moment: Moment) -> Values:
-    """Return the body rate setpoint FRD [rad/s] and the thrust setpoint, body -1..0."""
-    state = moment.state
-    return *state.rate_setpoint.tolist(), 0.0, 0.0, -state.thrust_setpoint
-
-
-@_logged("vehicle_attitude", 40, "uint64_t timestamp_sample; float[4] q")
-def attitude(moment: Moment) -> Values:
-    """Return the estimated attitude, body -> NED."""
-    estimate = moment.state.estimate
-    return estimate.time_us, *estimate.quaternion.tolist()
-
-
-@_logged("vehicle_attitude_groundtruth", 40, "uint64_t timestamp_sample; float[4] q")
-def true_attitude(moment: Moment) -> Values:
-    """Return the true attitude, body -> NED."""
-    return moment.truth.time_us, *moment.truth.quaternion.tolist()
-
-
-@_logged(
-    "vehicle_attitude_setpoint", 40, "float yaw_sp_move_rate; float[4] q_d; float[3] thrust_body"
-)
-def attitude_setpoint(moment: Moment) -> Values:
-    """Return the setpoints of yaw rate [rad/s], attitude and thrust."""
-    state = moment.state
-    yaw_rate = state.setpoint.yaw_rate
-    moved = 0.0 if math.isnan(yaw_rate) else yaw_rate
-    return moved, *state.attitude_setpoint.tolist(), 0.0, 0.0, -state.thrust_setpoint
-
-
-@_logged("vehicle_acceleration", 40, "uint64_t timestamp_sample; float[3] xyz")
-def acceleration(moment: Moment) -> Values:
-    """Return the specific force minus the estimated bias, FRD [m/s²]."""
-    state = moment.state
-    return state.time_us, *(state.accel - state.estimate.accel_bias).tolist()
-
-
-@_logged(
-    "vehicle_local_position",
-    100,
-    "uint64_t timestamp_sample; double ref_lat ref_lon; "
-    "float x y z vx vy vz z_deriv ax ay az heading ref_alt eph epv evh evv; "
-    "bool xy_valid z_valid v_xy_valid v_z_valid xy_global z_global; "
-    "float dist_bottom dist_bottom_var; bool dist_bottom_valid; "
-    "uint8_t dist_bottom_reset_counter dist_bottom_sensor_bitfield",
-)
-def local_position(moment: Moment) -> Values:
-    """Return the estimated position [m] and velocity [m/s], NED, with accuracy and validity."""
-    state = moment.state
-    estimate, origin = state.estimate, state.origin
-    sigma = estimate.sigma.tolist()
-    known = origin is not None
-    reference = (math.nan, math.nan, math.nan) if origin is None else origin
-    velocity, healthy = estimate.velocity.tolist(), bool(estimate.healthy)
-    return (
-        estimate.time_us,
-        *reference[:2],
-        *estimate.position.tolist(),
-        *velocity,
-        velocity[2],
-        *estimate.acceleration.tolist(),
-        frames.quat_yaw(estimate.quaternion),
-        reference[2],
-        math.hypot(*sigma[0:2]),
-        sigma[2],
-        math.hypot(*sigma[3:5]),
-        sigma[5],
-        *(healthy,) * 4,
-        *(known and healthy,) * 2,
-        *_clearance(state),
-    )
-
-
-def _clearance(state: snapshot.AutopilotState) -> Values:
-    """Return the distance to the ground [m], variance [m²], validity, resets and sensor."""
-    ground = state.clearance
-    if ground is None:
-        return _UNKNOWN, _UNKNOWN, False, 0, 0
-    return (
-        ground.dist_bottom_m,
-        ground.variance_m2,
-        ground.valid,
-        ground.resets % 256,
-        DIST_BOTTOM_SENSOR_RANGE if ground.by_range else 0,
-    )
-
-
-@_logged(
-    "vehicle_local_position_groundtruth",
-    100,
-    "uint64_t timestamp_sample; float x y z vx vy vz z_deriv heading; "
-    "bool xy_valid z_valid v_xy_valid v_z_valid",
-)
-def true_local_position(moment: Moment) -> Values:
-    """Return the true position [m] and velocity [m/s], NED."""
-    truth = moment.truth
-    velocity = truth.velocity.tolist()
-    heading = frames.quat_yaw(truth.quaternion)
-    return truth.time_us, *truth.position.tolist(), *velocity, velocity[2], heading, *(True,) * 4
-
-
-@_logged(
-    "vehicle_local_position_setpoint",
-    100,
-    "float x y z vx vy vz; float[3] acceleration thrust; float yaw yawspeed",
-)
-def local_position_setpoint(moment: Moment) -> Values:
-    """Return the setpoint of the position controller, NED."""
-    setpoint = moment.state.setpoint
-    position, velocity = setpoint.position.tolist(), setpoint.velocity.tolist()
-    return (*position, *velocity, *_NO_VECTOR, *_NO_VECTOR, setpoint.yaw, setpoint.yaw_rate)
-
-
-@_logged(
-    "actuator_motors",
-    100,
-    f"uint64_t timestamp_sample; float[{MOTORS}] control; uint16_t reversible_flags",
-)
-def motors(moment: Moment) -> Values:
-    """Return the motor commands 0..1; NaN while disarmed."""
-    state = moment.state
-    armed = state.status.arming is autopilot_state.Arming.ARMED
-    motors = state.motors if armed else (math.nan,) * 4
-    return state.time_us, *motors, *_UNUSED_MOTORS, 0
-
-
-@_logged(
-    "vehicle_gps_position",
-    100,
-    "uint64_t timestamp_sample; "
-    "double latitude_deg longitude_deg altitude_msl_m altitude_ellipsoid_m; "
-    "uint64_t time_utc_usec; float eph epv vel_m_s vel_n_m_s vel_e_m_s vel_d_m_s cog_rad; "
-    "uint8_t fix_type; bool vel_ned_valid; uint8_t satellites_used",
-)
-def gps(moment: Moment) -> Values | None:
-    """Return the newest GPS fix."""
-    fix = moment.state.gps
-    if fix is None:
+def _constant(source: str) -> float | None:
+    """Return the value of a constant source; None = not constant."""
+    if source.startswith("bits."):
+        need = flight_modes.Need[source.removeprefix("bits.")]
+        return sum(mode.spec.state_bits for mode in flight_modes.Mode if need in mode.spec.needs)
+    try:
+        return float(source)
+    except ValueError:
         return None
-    latitude, longitude, altitude = fix.position
-    north, east, down = fix.velocity_ned.tolist()
-    return (
-        moment.state.time_us,
-        latitude,
-        longitude,
-        altitude,
-        altitude,
-        moment.unix_us,
-        fix.eph_m,
-        fix.epv_m,
-        math.hypot(north, east, down),
-        north,
-        east,
-        down,
-        math.atan2(east, north),
-        fix.fix_type,
-        True,
-        fix.satellites,
-    )
 
 
-def _of_sensor(name: str, logged: sensor_table.SensorTopic) -> Logged:
-    """Return the topic of a sensor, whose values are in the flight controller's state."""
-
-    def values(moment: Moment) -> Values | None:
-        return logged.values(moment.state)
-
-    return Logged(_topic(name, logged.fields), logged.interval_ms * constants.US_PER_MS, values)
-
-
-TOPICS += [_of_sensor(*each) for s in sensor_table.sensors().values() for each in s.topics.items()]
-
-
-@_logged(
-    "vehicle_global_position",
-    200,
-    "uint64_t timestamp_sample; double lat lon; float alt alt_ellipsoid eph epv; "
-    "bool lat_lon_valid alt_valid",
-)
-def global_position(moment: Moment) -> Values | None:
-    """Return the estimated global position."""
-    state = moment.state
-    estimate, origin = state.estimate, state.origin
-    if origin is None or not estimate.healthy:
-        return None
-    latitude, longitude, altitude = frames.local_to_geodetic(estimate.position, origin)
-    sigma = estimate.sigma.tolist()
-    accuracy = math.hypot(*sigma[0:2]), sigma[2]
-    return estimate.time_us, latitude, longitude, altitude, altitude, *accuracy, True, True
-
-
-@_logged(
-    "vehicle_air_data",
-    200,
-    "uint64_t timestamp_sample; float baro_alt_meter baro_temp_celcius baro_pressure_pa",
-)
-def air_data(moment: Moment) -> Values | None:
-    """Return the pressure [Pa] and the pressure altitude [m]."""
-    state = moment.state
-    if not math.isfinite(state.pressure_hpa):
-        return None
-    altitude = atmosphere.altitude_m(state.pressure_hpa)
-    pa_per_hpa = 100.0
-    return state.time_us, altitude, state.temperature_c, pa_per_hpa * state.pressure_hpa
+def _load() -> list[Logged]:
+    """Return the topics of `topics.toml` and of the sensors."""
+    found, topics = [], dict[str, Topic]()
+    for name, table in read_table(__file__).items():
+        keys = {key: table.pop(key) for key in ("rows", "changes", "when", "time") if key in table}
+        interval_us = table.pop("interval_ms", 0) * constants.US_PER_MS
+        fields, known = [], {}
+        for each, described in table.items():
+            kind, _, known[each] = described.partition(" ")
+            fields.append(f"{kind} {each}")
+        fixed = {each: _constant(source) for each, source in known.items()}
+        topics[name] = topic = Topic(
+            name,
+            tuple(fields),
+            {each: value for each, value in fixed.items() if value is not None},
+            {kind: topics[kind] for kind in (f.split()[0] for f in fields) if kind in topics},
+        )
+        sources = {each: s for each, s in known.items() if s and fixed[each] is None}
+        if interval_us or keys:
+            found.append(Logged(topic, interval_us, **keys, sources=sources))
+    for sensor in sensor_table.sensors().values():
+        for name, logged in sensor.topics.items():
+            groups = (group.split() for group in logged.fields.split("; "))
+            described = tuple(f"{kind} {each}" for kind, *names in groups for each in names)
+            interval_us = logged.interval_ms * constants.US_PER_MS
+            found.append(Logged(Topic(name, described), interval_us, "state", values=logged.values))
+    return found
 
 
-@_logged("vehicle_magnetometer", 200, "uint64_t timestamp_sample; float[3] magnetometer_ga")
-def magnetometer(moment: Moment) -> Values:
-    """Return the newest magnetic field FRD [gauss]."""
-    return moment.state.time_us, *moment.state.mag.tolist()
-
-
-@_logged(
-    "battery_status",
-    200,
-    "float voltage_v current_a discharged_mah remaining scale temperature; bool connected; "
-    "uint8_t id",
-)
-def battery(moment: Moment) -> Values:
-    """Return the battery status reported by the power module."""
-    voltage, current, consumed, remaining = moment.state.battery
-    connected, number = True, 1
-    return voltage, current, consumed, remaining, 1.0, _UNKNOWN, connected, number
-
-
-@_logged(
-    "estimator_status",
-    200,
-    "uint64_t timestamp_sample; "
-    "float pos_horiz_accuracy pos_vert_accuracy hdg_test_ratio vel_test_ratio "
-    "pos_test_ratio hgt_test_ratio; uint8_t health_flags timeout_flags",
-)
-def estimator_status(moment: Moment) -> Values:
-    """Return accuracies [m] and innovation test ratios."""
-    estimate = moment.state.estimate
-    sigma, ratio = estimate.sigma.tolist(), estimate.innovation_ratio.tolist()
-    horizontal, height, heading, vertical = ratio
-    accuracy = math.hypot(*sigma[0:2]), sigma[2]
-    # PX4's EKF also leaves the last two at 0.
-    health, timeouts = 0, 0
-    tests = heading, max(horizontal, vertical), horizontal, height
-    return estimate.time_us, *accuracy, *tests, health, timeouts
-
-
-@_logged(
-    "vehicle_status",
-    None,
-    "uint8_t arming_state nav_state_user_intention nav_state vehicle_type; "
-    "bool failsafe pre_flight_checks_pass",
-)
-def status(moment: Moment) -> Values:
-    """Return the arming state and the flight mode."""
-    status = moment.state.status
-    return (
-        ARMED if status.arming is autopilot_state.Arming.ARMED else DISARMED,
-        status.intended_mode.spec.state,
-        status.mode.spec.state,
-        ROTARY_WING,
-        status.failsafe,
-        status.arming is not autopilot_state.Arming.BOOT,
-    )
-
-
-@_logged("actuator_armed", None, "bool armed ready_to_arm")
-def armed(moment: Moment) -> Values:
-    """Return the armed flag and the ready-to-arm flag."""
-    arming = moment.state.status.arming
-    return arming is autopilot_state.Arming.ARMED, arming is not autopilot_state.Arming.BOOT
-
-
-@_logged("vehicle_land_detected", None, "bool ground_contact maybe_landed landed")
-def land_detected(moment: Moment) -> Values:
-    """Return the landed flags."""
-    landed = moment.state.status.landed is autopilot_state.Landed.ON_GROUND
-    return landed, landed, landed
-
-
-@_logged("home_position", None, "double lat lon; float alt; bool valid_alt valid_hpos")
-def home(moment: Moment) -> Values | None:
-    """Return the home position."""
-    home = moment.state.home
-    return None if home is None else (*home, True, True)
+TOPICS = _load()
+"""Logged topics, in the order of the log."""

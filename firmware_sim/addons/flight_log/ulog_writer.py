@@ -6,23 +6,29 @@ message consists of content length, type and content.
 
 from __future__ import annotations
 
-import math
 import struct
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.core.files import LogFile
 
 Values = tuple[float | int | bool, ...]
 
-_GREATEST_SINGLE = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
-
 _MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 _VERSION = 1
 _HEAD = struct.Struct("<HB")
+_HEADER = ("_size", "<u2"), ("_type", "u1"), ("_id", "<u2")
+"""Fields of a sample before its timestamp."""
+
+HEAD_BYTES = 13
+"""Size of these fields and of the timestamp."""
+
 _FLAG_BYTES = 40
 """Content of the flag message: compatible and incompatible flags, offsets of appended data."""
 
@@ -48,6 +54,10 @@ class Topic:
     name: str
     fields: tuple[str, ...]
     """Fields after the timestamp, the first field of every topic."""
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Values of fields that never change."""
+    parts: Mapping[str, Topic] = field(default_factory=dict)
+    """Topics that are types of fields, by name."""
 
     @cached_property
     def definition(self) -> bytes:
@@ -55,14 +65,55 @@ class Topic:
         return f"{self.name}:{';'.join(('uint64_t timestamp', *self.fields))};".encode("ascii")
 
     @cached_property
-    def sample(self) -> struct.Struct:
-        """Layout of one sample: topic number, timestamp and fields."""
-        return struct.Struct("<HQ" + "".join(_code(field.split()[0]) for field in self.fields))
+    def content(self) -> list[Any]:
+        """Timestamp and fields as fields of a dtype."""
+        found: list[Any] = [("timestamp", "<u8")]
+        for each in self.fields:
+            (kind, _, count), name = each.split()[0].rstrip("]").partition("["), each.split()[1]
+            if part := self.parts.get(kind):
+                found += [(f"{name}.{inner}", *rest) for inner, *rest in part.content]
+            else:
+                found.append((name, f"<{_CODES[kind]}", *([int(count)] if count else [])))
+        return found
 
+    @cached_property
+    def blank(self) -> NDArray[Any]:
+        """Message without values (1,): a float is NaN, an integer 0, a bool false."""
+        blank = np.zeros(1, np.dtype([*_HEADER, *self.content]))
+        for name in blank.dtype.names or ():
+            if blank[name].dtype.kind == "f":
+                blank[name] = np.nan
+        blank["_size"], blank["_type"] = blank.dtype.itemsize - _HEAD.size, ord("D")
+        for name, value in self.constants.items():
+            blank[name] = value
+        return blank
 
-def _code(kind: str) -> str:
-    name, _, count = kind.rstrip("]").partition("[")
-    return f"{count}{_CODES[name]}"
+    def rows(self, times_us: Any, columns: Mapping[str, Any]) -> NDArray[Any]:
+        """Return messages (n,) with values (n, ...) of fields by name; the others are blank.
+
+        Values beyond single precision become infinite, as on real hardware.
+        """
+        rows = self.blank.repeat(len(times_us))
+        rows["timestamp"] = times_us
+        with np.errstate(over="ignore"):
+            for name, value in columns.items():
+                # A field of another topic's type has values by its fields.
+                if isinstance(value, Mapping):
+                    for inner, each in value.items():
+                        rows[f"{name}.{inner}"] = each
+                else:
+                    rows[name] = value
+        return rows
+
+    def row(self, time_us: int, values: Values) -> NDArray[Any]:
+        """Return a message (1,) with the values of all fields in order; check their number."""
+        columns, rest = {}, list(values)
+        for name, _, *shape in self.content[1:]:
+            count = shape[0] if shape else 1
+            columns[name], rest = rest[:count] if shape else rest[0], rest[count:]
+        if rest:
+            raise ValueError(f"{self.name}: {len(rest)} values too many")
+        return self.rows((time_us,), columns)
 
 
 class UlogWriter(LogFile):
@@ -79,23 +130,25 @@ class UlogWriter(LogFile):
     ) -> None:
         """Open the file with final name `path` and write the head; for `on_lost` see `LogFile`.
 
-        The index of a topic is the number for `sample`. Info has ULog keys, numbers as uint32_t.
-        An int parameter is written as int32_t.
+        The index of a topic is the number for `sample`. Info has ULog keys; the type of a number
+        is in its key, default uint32_t. An int parameter is written as int32_t.
         """
         super().__init__(path, on_lost)
-        topics = tuple(topics)
-        self._samples = [topic.sample for topic in topics]
+        self._topics = topics = tuple(topics)
         self._now_us = start_us
         self.add(start_us, _MAGIC, struct.pack("<BQ", _VERSION, start_us))
         self._message(b"B", bytes(_FLAG_BYTES))
-        for topic in topics:
-            self._message(b"F", topic.definition)
+        formats = {each.name: each for topic in topics for each in (topic, *topic.parts.values())}
+        for each in formats.values():
+            self._message(b"F", each.definition)
         for key, value in info:
+            kind, _, name = key.rpartition(" ")
+            code = f"<{_CODES[kind or 'uint32_t']}"
             self._message(
                 b"I",
-                _text(key, value)
-                if isinstance(value, str)
-                else _keyed("uint32_t", key, struct.pack("<I", value)),
+                _keyed(kind or "uint32_t", name, struct.pack(code, value))
+                if isinstance(value, int)
+                else _text(key, value),
             )
         for name, number in parameters:
             self.parameter(name, number)
@@ -107,18 +160,15 @@ class UlogWriter(LogFile):
         """Size of the file before the first sample [bytes]."""
 
     def sample(self, number: int, time_us: int, values: Values) -> None:
-        """Add a sample of topic `number` at simulated `time_us` [µs]; check the fields.
+        """Add a sample of topic `number` at simulated `time_us` [µs], all its values in order."""
+        self.samples(number, self._topics[number].row(time_us, values))
 
-        Values beyond single precision become infinite, as on real hardware.
-        """
-        layout = self._samples[number]
-        self._now_us = time_us
-        head = _HEAD.pack(layout.size, ord("D"))
-        try:
-            data = layout.pack(number, time_us, *values)
-        except OverflowError:
-            data = layout.pack(number, time_us, *map(_single, values))
-        self.add(time_us, head, data)
+    def samples(self, number: int, rows: NDArray[Any]) -> None:
+        """Add messages (n,) of topic `number`, from `Topic.rows`."""
+        if len(rows):
+            rows["_id"] = number
+            self._now_us = rows["timestamp"][-1].item()
+            self.add(self._now_us, rows.tobytes())
 
     def text(self, time_us: int, severity: int, text: str) -> None:
         """Add a text at simulated `time_us` [µs], with severity 0 (emergency) to 7 (debug)."""
@@ -143,10 +193,3 @@ def _text(key: str, value: str) -> bytes:
 def _keyed(kind: str, key: str, data: bytes) -> bytes:
     described = f"{kind} {key}".encode("ascii")
     return bytes([len(described)]) + described + data
-
-
-def _single(value: Any) -> Any:
-    """Return a float beyond single precision as infinity; other values unchanged."""
-    if not isinstance(value, float) or abs(value) <= _GREATEST_SINGLE:
-        return value
-    return math.copysign(math.inf, value)

@@ -123,7 +123,7 @@ class Watch:
         """Motor failure detector."""
         self.reports = Reports()
         """Reports from other parts of the autopilot."""
-        self._setpoint_us: int | None = None
+        self.setpoint_us: int | None = None
         self._setpoint: Setpoint | None = None
         self._manual_us: int | None = None
         self._gcs_us: int | None = None
@@ -166,7 +166,7 @@ class Watch:
 
     def hear_setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
         """Record a valid offboard setpoint; None = attitude or body rates."""
-        self._setpoint, self._setpoint_us = setpoint, time_us
+        self._setpoint, self.setpoint_us = setpoint, time_us
 
     def hear_pilot(self, time_us: int) -> None:
         """Record valid pilot input: MANUAL_CONTROL or RC."""
@@ -181,7 +181,7 @@ class Watch:
     def offboard_lost(self, time_us: int) -> bool:
         """Return whether no usable setpoint arrived within COM_OF_LOSS_T."""
         setpoint = self._setpoint
-        if _silent(self._setpoint_us, time_us, self.settings.com_of_loss_t):
+        if _silent(self.setpoint_us, time_us, self.settings.com_of_loss_t):
             return True
         # Attitude and rate setpoints need no position estimate.
         if setpoint is None:
@@ -227,7 +227,7 @@ class Watch:
     def _reported(self, now_us: int) -> tuple[object, ...]:
         # Everything that can change without a measurement.
         reports, recovery, p = self.reports, self._estimator.recovery, self.settings
-        setpoint_us, manual_us, gcs_us = self._setpoint_us, self._manual_us, self._gcs_us
+        setpoint_us, manual_us, gcs_us = self.setpoint_us, self._manual_us, self._gcs_us
         return (
             setpoint_us is None or now_us - setpoint_us > p.com_of_loss_t * US_PER_S,
             manual_us is None or now_us - manual_us > p.com_rc_loss_t * US_PER_S,

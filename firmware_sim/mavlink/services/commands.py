@@ -16,7 +16,6 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import NavigationMode
-from firmware_sim.autopilot.events.flight_events import AUTO_MODE_UNSUPPORTED, MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.flight_modes import MAIN_AUTO, MAIN_POSCTL, Mode
 from firmware_sim.autopilot.modes.interface import OrbitRequest, PositionYaw, Reposition
 from firmware_sim.mavlink import codec, services
@@ -268,12 +267,20 @@ def handle_set_mode(message: codec.WireMessage, context: services.Context) -> bo
     return True
 
 
-def _handle(command: services.VehicleCommand, context: services.Context) -> bool:
-    # None means no COMMAND_ACK at all: PX4 leaves some commands unanswered.
+def execute(command: services.VehicleCommand, context: services.Context) -> Result | None:
+    """Log and execute a command; None means no COMMAND_ACK: PX4 leaves some unanswered."""
+    fields = *command.params, command.number, context.system_id, codec.COMPONENT_ID
+    confirmation, from_external = 0, True
+    values = *fields, *command.sender, confirmation, from_external
+    context.port.logs.command(values, context.now_us)
     action = services.table("ACTIONS").get(command.number)
     if command.number in context.port.parameters.release.unknown_commands:
         action = None
-    result = Result.UNSUPPORTED if action is None else action(command, context)
+    return Result.UNSUPPORTED if action is None else action(command, context)
+
+
+def _handle(command: services.VehicleCommand, context: services.Context) -> bool:
+    result = execute(command, context)
     if result is not None:
         context.link.send(
             codec.dialect.MAVLink_command_ack_message(command.number, result, 0, 0, *command.sender)
@@ -289,14 +296,14 @@ def is_addressed(message: codec.WireMessage, context: services.Context) -> bool:
 
 
 _CRITICAL = Severity.CRITICAL
-_UNSUPPORTED = OperatorText.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
+_UNSUPPORTED = OperatorText.of(_CRITICAL, events.AUTO_MODE_UNSUPPORTED)
 
 
 def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> OperatorText:
     """Return PX4's rejection of a known but unavailable mode."""
     number = sub << 24 | main << 16
     text = f"Switching to {name} is currently not available"
-    return OperatorText.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
+    return OperatorText.of(_CRITICAL, events.MODE_NOT_AVAILABLE, number, mode, text=text)
 
 
 # Modes by main and sub mode. Texts stand for modes that a real PX4 knows by name but never makes

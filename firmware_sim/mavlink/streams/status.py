@@ -43,7 +43,7 @@ _BOARD_VERSION = 1
 _CUSTOM_VERSION = b"airl-mav"
 """Custom version, in place of the first 8 bytes of a real PX4's git hash."""
 
-_UID = 0x4149_524C_4D41_5601
+UID = 0x4149_524C_4D41_5601
 """Constant hardware id, identical for all emulated vehicles."""
 
 _MAVLINK_VERSION = 3
@@ -243,7 +243,7 @@ def autopilot_version(version: int) -> Values:
         CAPABILITIES,
         *(version, version, os_version, _BOARD_VERSION),
         *(*_CUSTOM_VERSION, *middleware_custom_version, *os_custom_version),
-        *(vendor, product, _UID),
+        *(vendor, product, UID),
     )
 
 
