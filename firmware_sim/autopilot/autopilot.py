@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 
 # Bound once: looking up an enum member in every tick is slow.
 _GROUND, _AIR = commander.FlightPhase.GROUND, commander.FlightPhase.AIR
+
+MAX_TEXTS = 100
+"""Maximum number of texts in `BuiltinAutopilot.said`."""
 
 
 class BuiltinAutopilot:
@@ -73,6 +77,8 @@ class BuiltinAutopilot:
         self._memory: frames.Vector = record["memory"][0]
         parameters.on_change(self._parameters_changed)
         self._messages: list[autopilot_state.OperatorText] = []
+        self.said = deque[autopilot_state.OperatorText](maxlen=MAX_TEXTS)
+        """Newest operator texts, for `dmesg`."""
         self._demand: AnyDemand | None = None
         """Active demand; None = the motors are stopped."""
         self._taken_us = -1
@@ -367,6 +373,7 @@ class BuiltinAutopilot:
     def say(self, message: autopilot_state.OperatorText) -> None:
         """Send a text to the operator."""
         self._messages.append(message)
+        self.said.append(message)
         if message.event is not None:
             self._events.append(message.event)
         if self.on_message is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -113,10 +113,10 @@ class Parameters:
             self._changed()
         return self.by_name(name)
 
-    def reset(self) -> None:
-        """Return to the defaults, including a vehicle profile's overrides."""
-        for name, value in self._defaults.items():
-            self._store(name, value)
+    def reset(self, names: Iterable[str] | None = None) -> None:
+        """Return parameters, None = all, to the defaults, including a profile's overrides."""
+        for name in self._defaults if names is None else names:
+            self._store(name, self._defaults[name])
         self._changed()
 
     def load(self) -> bool:

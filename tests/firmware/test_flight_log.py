@@ -231,7 +231,7 @@ def test_the_info_is_that_of_px4(flown: tuple[Path, ULog]) -> None:
     info = flown[1].msg_info_dict
     assert info["sys_name"] == "airl-mav" and info["ver_hw"] == "PX4_SITL"
     assert info["ver_sw"].startswith("airl-mav ") and info["ver_sw_branch"] == "built-in"
-    assert info["ver_sw_release"] == status.FIRMWARE_VERSION
+    assert info["ver_sw_release"] == px4_release().flight_sw_version
     assert int(info["sys_uuid"], 16) == status.UID and info["time_ref_utc"] == 0
 
 

@@ -64,7 +64,9 @@ FOREIGN: dict[str, list[Any]] = {
         ),
     ],
     "SERIAL_CONTROL": [
-        dialect.MAVLink_serial_control_message(SHELL, 0, 0, 0, 4, list(b"ver\n".ljust(70, b"\0")))
+        dialect.MAVLink_serial_control_message(
+            *(SHELL, 0, 0, 0, 24, list(b"param set NAV_DLL_ACT 0\n".ljust(70, b"\0")))
+        )
     ],
     "FILE_TRANSFER_PROTOCOL": [ftp(9, b"/fs/microsd/d")],
     "FOLLOW_TARGET": [

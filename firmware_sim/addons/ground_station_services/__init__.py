@@ -2,7 +2,7 @@
 
 MAVLink FTP with the vehicle's files, metadata of parameters and events, download of flight logs,
 sensor calibration, PX4's shell, and messages that are sent on request only.
-Depends on: `firmware_sim.mavlink`, `firmware_sim.autopilot`; logs require the add-on `flight_log`.
+Depends on: `firmware_sim.mavlink`, `firmware_sim.autopilot`; logs and topics need `flight_log`.
 Guide: docs/how-to/connect.md.
 """
 

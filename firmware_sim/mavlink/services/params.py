@@ -77,14 +77,23 @@ def handle_set(message: WireMessage, context: services.Context) -> bool:
         error = _ERROR_TYPE_MISMATCH
     elif not math.isfinite(value := _received_value(message)):
         error = dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
-    elif (stored := store.set(present.name, value)) is None:
+    elif store_parameter(present.name, value, context) is None:
         error = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
     else:
-        # All clients receive the new value, as in PX4.
-        context.broadcast(*_value_message(stored, len(store)))
         return True
     _send_error(message, -1, error, context)
     return True
+
+
+def store_parameter(
+    name: str, value: int | float, context: services.Context
+) -> ParameterValue | None:
+    """Store a value; all clients receive it, as in PX4. Returns None for an unknown name."""
+    store = context.port.parameters
+    stored = store.set(name, value)
+    if stored is not None:
+        context.broadcast(*_value_message(stored, len(store)))
+    return stored
 
 
 def _send_error(message: WireMessage, index: int, error: int, context: services.Context) -> None:
