@@ -396,13 +396,6 @@ SECTIONS = (
     ),
     PageSection("worst", "Worst flights", _worst),
     PageSection("by-flight", "Flight by flight", by_flight_section),
-    PageSection(
-        "estimator",
-        "Estimator",
-        lambda page: tables_section(
-            run_tables.estimation_table([each.tracked for each in page.view])
-        ),
-    ),
     PageSection("latency", "Decision latency", latency_section),
     PageSection("flights", "Flights", flights_section),
     PageSection("made", "How it was made", _provenance),

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,6 @@ from airl_mav.report.measures import (
     rate_digits,
     summarize_run,
 )
-
-if TYPE_CHECKING:
-    from airl_mav.report import tracking
 
 BYTES_PER_MIB = 1 << 20
 
@@ -246,34 +243,6 @@ def _real_time_factor(run: LoadedRun) -> str:
         return "not paced"
     flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
     return f"{flown_us / constants.US_PER_S / wall_s:.3f} (asked {run.info.setup.speed:g})"
-
-
-ROWS = (
-    ("position, seen from above", "aside_m", "m"),
-    ("height", "height_m", "m"),
-    ("velocity", "velocity_m_s", "m/s"),
-    ("roll or pitch", "tilt_deg", "°"),
-    ("heading", "heading_deg", "°"),
-)
-
-
-def estimation_table(flights: Sequence[tracking.TrackedFlight]) -> document.TableView | None:
-    """Return the errors of the estimator in navigation; None without recorded estimates."""
-    known = [(f.time_s >= 0.0, f.errors) for f in flights if f.errors is not None]
-    known = [(flies, errors) for flies, errors in known if flies.any()]
-    if not known:
-        return None
-    rows = []
-    for title, name, unit in ROWS:
-        values = np.concatenate([getattr(errors, name)[flies] for flies, errors in known])
-        figures = (np.median(values), np.percentile(values, 95.0), values.max())
-        rows.append((title, unit, *(f"{figure:.2f}" for figure in figures)))
-    columns = document.columns_of("<error of the estimate | <unit | median | p95 | greatest")
-    notes = (
-        f"Between what the flight controller believed and the true state, 50 times a second, "
-        f"{len(known):,} flights from the start of navigation.",
-    )
-    return document.TableView("estimation", "Estimator", columns, tuple(rows), notes)
 
 
 def run_ages(run: LoadedRun) -> CommandAges:

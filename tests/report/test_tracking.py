@@ -12,7 +12,6 @@ from airl_mav.core.frames import quat_wxyz_to_xyzw
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.run_report import chosen, flight_data, packed, steps_of
-from airl_mav.report.run_tables import estimation_table
 from airl_mav.report.tracking import held, track
 from tests.support.page_alone import unpacked
 from tests.support.run_demo import write_demo_run
@@ -76,11 +75,6 @@ def test_errors_of_the_estimate_are_those_that_were_put_in(turning: LoadedRun) -
     assert np.allclose(flight.errors.velocity_m_s, 0.1)
     assert np.allclose(flight.errors.tilt_deg, 0.5, atol=1e-6)
     assert np.allclose(flight.errors.heading_deg, 2.0, atol=1e-6)
-    view = estimation_table([flight])
-    assert view is not None
-    told = {row[0]: row[1:] for row in view.rows}
-    assert told["position, seen from above"] == ("m", "0.50", "0.50", "0.50")
-    assert told["heading"] == ("°", "2.00", "2.00", "2.00")
 
 
 def test_a_flight_without_estimates_has_no_errors(turning: LoadedRun) -> None:
@@ -89,7 +83,6 @@ def test_a_flight_without_estimates_has_no_errors(turning: LoadedRun) -> None:
     assert flight is not None
     assert flight.estimated is None
     assert flight.errors is None
-    assert estimation_table([flight]) is None
     assert track(replace(turning, trajectories={}), turning.episodes[0]) is None
 
 
