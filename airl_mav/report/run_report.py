@@ -270,7 +270,6 @@ def by_flight_section(page: ReportInput) -> tuple[Section, ...]:
 def flights_section(page: ReportInput) -> tuple[Section, ...]:
     """Return the table of flights, and still pictures of the worst."""
     top = plotly_scene.top_speed([flight.scene for flight in page.view])
-    range_m = 0.0 if page.vehicle is None else page.vehicle.camera.range_m
     causes = {each.record.index: each.cause for each in page.worst}
     drawn: list[tuple[EpisodeRecord, Cause | None, list[FigureImage]]] = []
     for record in pictured(page.run):
@@ -278,9 +277,6 @@ def flights_section(page: ReportInput) -> tuple[Section, ...]:
         flight = None if number is None else page.view[number]
         path = None if flight is None else flight.scene.path
         pictures = [map_figure(record, path, page.arenas.get(record.index), top)]
-        if flight is not None:
-            seen = [flight.seen[k] for k in chosen(len(flight.seen), tracking.IMAGES, 2)]
-            pictures.append(tracking.tracking_figure(flight.tracked, seen, range_m))
         drawn.append((record, causes.get(record.index), pictures))
     return tables_section(
         run_tables.episodes_table(page.run, run_tables.MAX_FLIGHTS),

@@ -377,9 +377,9 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
         assert absent not in page.words
         assert absent not in text
     # The four stages that vary from decision to decision and their timeline, energy, all flights;
-    # a map and a figure over time for each flight that is pictured.
+    # a map for each flight that is pictured.
     assert run_report.MAX_PICTURED < EPISODES
-    assert page.images == 3 + 3 + 2 * run_report.MAX_PICTURED
+    assert page.images == 3 + 3 + run_report.MAX_PICTURED
     assert f"Pictures of {run_report.MAX_PICTURED} of {EPISODES} flights" in page.words
     pictured = {int(p.name[7:10]) for p in run_.path.glob("flight-*-map.png")}
     assert pictured <= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}

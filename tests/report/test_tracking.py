@@ -12,7 +12,7 @@ from airl_mav.core.frames import quat_wxyz_to_xyzw
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.run_report import chosen, flight_data, packed, steps_of
-from airl_mav.report.tracking import held, track
+from airl_mav.report.tracking import track
 from tests.support.page_alone import unpacked
 from tests.support.run_demo import write_demo_run
 
@@ -84,21 +84,6 @@ def test_a_flight_without_estimates_has_no_errors(turning: LoadedRun) -> None:
     assert flight.estimated is None
     assert flight.errors is None
     assert track(replace(turning, trajectories={}), turning.episodes[0]) is None
-
-
-def test_a_command_holds_until_the_next_one_is_sent(turning: LoadedRun) -> None:
-    flight = track(turning, turning.episodes[0])
-    assert flight is not None
-    stamps, zero_us = turning.latency[0], turning.episodes[0].navigation_us
-    flown = held(flight.commands, "forward_m_s", flight.time_s)
-    turns = held(flight.commands, "yaw_rate_deg_s", flight.time_s)
-    for k, seconds in enumerate(flight.time_s):
-        before = [i for i, us in enumerate(stamps["sent_us"]) if (us - zero_us) / 1e6 <= seconds]
-        if not before:
-            assert np.isnan(flown[k])
-            continue
-        assert flown[k] == pytest.approx(stamps["setpoint"][before[-1]][0])
-        assert turns[k] == pytest.approx(np.degrees(stamps["setpoint"][before[-1]][3]))
 
 
 def test_what_is_packed_is_what_comes_out() -> None:
