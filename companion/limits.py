@@ -49,10 +49,10 @@ REASONS = (
 MODE_KNOWN_S = 3.0
 """Maximum latency of the report of a mode change [s]: three heartbeats of 1 Hz."""
 
-DRIFT_M, SELDOM_M = 1.0, 6.0
-"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m], with frequent
-and with seldom checks. A velocity that changes by 1 g and back adds g dt^2 / 4. Honest flights:
-0.4 m at 2 Hz, 4.7 m at 1 Hz."""
+SELDOM_M = 6.0
+"""Maximum difference of position and integrated velocity, leaking with `DRIFT_S` [m], with seldom
+checks; `LimitSettings.drift_m` with frequent ones. A velocity that changes by 1 g and back adds
+g dt^2 / 4. Honest flights: 0.4 m at 2 Hz, 4.7 m at 1 Hz; PX4's SIH: 2.4 m at 30 Hz."""
 
 SELDOM_S = 0.7
 """Time between two checks that are seldom [s]: the tilt has changed unseen."""
@@ -249,7 +249,7 @@ class VehicleLimits:
         self._fastest_m_s = SPEEDS * pilot.max_speed_m_s + SPEED_M_S if steady else FREE_M_S
         self._offboard = self._armed = False
         self._unchanged = [_Unchanged() for _ in TOLD]
-        self._motion = MotionMonitor(self._silence_us // 2)
+        self._motion = MotionMonitor(self._silence_us // 2, settings.drift_m)
         self._stamp_us: int | None = None
         self._usual_us = 0
         self._rest: Kinematics | None = None
@@ -394,9 +394,9 @@ class _Sample(NamedTuple):
 class MotionMonitor:
     """Consistency of position, velocity, attitude and body rates over time, and with gravity."""
 
-    def __init__(self, frozen_us: int) -> None:
-        """Set the maximum time for which one number may stay the same [µs]."""
-        self._frozen_us = frozen_us
+    def __init__(self, frozen_us: int, drift_m: float) -> None:
+        """Set the maximum time for which one number may stay the same [µs], and the drift [m]."""
+        self._frozen_us, self._bound_m = frozen_us, drift_m
         self._last: _Sample | None = None
         self._numbers: tuple[Any, ...] = ()
         self._changed_us: list[int] = []
@@ -492,7 +492,7 @@ class MotionMonitor:
         self._pause_m = SELDOM_M if seldom else leak * self._pause_m
         bound_m = self._pause_m
         if not seldom:
-            bound_m += DRIFT_M + 0.25 * GRAVITY_M_S2 * dt_s**2
+            bound_m += self._bound_m + 0.25 * GRAVITY_M_S2 * dt_s**2
         behind, self._behind = self._behind, parted_m > bound_m
         # After a pause of the link the position is old. The next one decides.
         if parted_m > bound_m and (behind or _beside_m(drift_m, b[3:6], dt_s) > bound_m):

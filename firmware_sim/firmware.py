@@ -15,6 +15,7 @@ import numpy as np
 from airl_mav.camera.frame import Frame
 from airl_mav.core import clock, constants, files
 from airl_mav.core.addons import entries, load
+from airl_mav.core.frames import Goal
 from airl_mav.flight.judge import Effect
 from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim import fault_timeline, interfaces
@@ -126,6 +127,12 @@ class FlightStack(Protocol):
     def counters(self) -> dict[str, LinkCounters]:
         """Return traffic counters by link name."""
 
+    def local(self, goal: Goal) -> Goal:
+        """Return a goal of the arena in the flight controller's local frame."""
+
+    def title(self) -> str:
+        """Return the source of the poses of a vehicle elsewhere; "" = it is simulated here."""
+
     def effects(self) -> Sequence[Effect]:
         """Return the messages that took effect on the vehicle in this episode, by sender.
 
@@ -168,6 +175,14 @@ class BuiltinFlightStack:
         del tick
         if self._autopilot is not None:
             self._server.attach(self._autopilot, truth)
+
+    def local(self, goal: Goal) -> Goal:
+        """Return the goal: the local frame is the arena's."""
+        return goal
+
+    def title(self) -> str:
+        """Return "": the vehicle is simulated here."""
+        return ""
 
     def close(self) -> None:
         """Save unsaved parameters and close the links."""

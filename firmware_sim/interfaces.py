@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from firmware_sim.autopilot.autopilot import BuiltinAutopilot
     from firmware_sim.autopilot.autopilot_state import OperatorText
     from firmware_sim.autopilot.commander import CommanderState
+    from firmware_sim.plant.body import PlantBody
 
 ULOG_SUFFIX = ".ulg"
 """Suffix of PX4's flight logs."""
@@ -229,6 +230,10 @@ class FlightController(Protocol):
 
     on_message: Callable[[OperatorText], None] | None
     """Callback for every operator text; None = no callback."""
+
+    @property
+    def body_by(self) -> Callable[..., PlantBody] | None:
+        """Factory of a body that moves elsewhere, see `plant.new_body`; None = a simulated one."""
 
     @property
     def rate_hz(self) -> int:

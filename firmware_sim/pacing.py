@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from airl_mav.core import constants, scheduling
-from airl_mav.core.clock import Clock, SimClock, WallClock
+from airl_mav.core.clock import NS_PER_US, Clock, SimClock, WallClock
 
 MAX_LAG_US = 200_000
 """Maximum lag to catch up [µs]; a larger lag is skipped: a burst of ticks would outrun the
@@ -80,9 +80,10 @@ class WallPacing:
     quiet_until_us = 0.0
     arrivals = None
 
-    def __init__(self, speed: float) -> None:
+    def __init__(self, speed: float, behind_us: int = 0) -> None:
         """Set the speed: simulated seconds per wall second, > 0.
 
+        Ticks begin `behind_us` after their time by the clock of other processes [simulated µs].
         Minimizes the timer slack of the calling thread; the default of Linux delays a wake-up by
         up to 50 µs to batch it with others. Requests short scheduler slices, to run before threads
         with longer ones: waiting for a whole foreign slice delays a tick by more than its length.
@@ -90,13 +91,14 @@ class WallPacing:
         ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
         scheduling.ask_for_short_slices()
         self.clock = WallClock(speed)
+        self._behind_ns = round(behind_us * NS_PER_US / speed)
         self.slipped_us = 0
         self._stamp_us = 0
 
     @property
     def epoch_ns(self) -> int:
         """Host monotonic time of simulated time 0 [ns]."""
-        return self.clock.epoch_ns
+        return self.clock.epoch_ns - self._behind_ns
 
     def restart(self, tick_us: int) -> None:
         """Set simulated time to `tick_us` [µs] at the present wall time.

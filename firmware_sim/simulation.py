@@ -205,6 +205,7 @@ class Simulation:
             airframe=draw_airframe(nominal, aircraft.spread, stream(setup.seed, Stream.AIRFRAME)),
             rate_hz=self.autopilot.rate_hz,
             computer_w=setup.computer_w,
+            body_by=self.autopilot.body_by,
         )
         self.autopilot.use_truth(self.plant.truth)
         self.faults: FaultTimeline | None = None

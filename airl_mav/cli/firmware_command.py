@@ -61,7 +61,7 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
 
     def ready(camera: str, goal: Goal) -> None:
         say(f"MAVSDK            udpin://{options.companion_host}:{options.companion_port}")
-        if not options.lockstep:
+        if not options.lockstep and options.firmware != "attach":
             say(f"QGroundControl    UDP port {options.ports.gcs_port} (connects by itself)")
             if options.firmware == "builtin":
                 ports = options.open_ports

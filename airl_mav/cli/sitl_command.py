@@ -139,7 +139,8 @@ def _announce(scenario: ResolvedScenario, console: Console) -> None:
         _say(console, f"MAVSDK     udpin://{LOOPBACK}:{asked.companion_port} (the companion's)")
         if asked.renderer in SLOW:
             _say(console, "camera     path traced in real time: images are as late as they take")
-    _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
+    if asked.firmware != "attach":
+        _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
     if setup.level == "firmware" and (hint := how_to_start(asked, scenario.vehicle)) is not None:
         _say(console, f"           start one for every flight: {hint}")
 

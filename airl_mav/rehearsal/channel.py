@@ -126,6 +126,10 @@ class Loaded(_Line):
     slipped_us: int
     """Simulated time skipped before the episode because the host could not keep up [µs]."""
     goal: Goal
+    local_goal: Goal
+    """Goal in the flight controller's local frame, where the companion flies."""
+    poses: str
+    """Source of the poses of a vehicle elsewhere; empty if it is simulated here."""
     firmware: str = ""
     """Name and version of real firmware; empty for the built-in autopilot."""
 

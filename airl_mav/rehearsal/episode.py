@@ -47,8 +47,12 @@ class Order(Enum):
 class EpisodeSupervisor:
     """Supervisor of one episode. Pure: no clock, no I/O."""
 
-    def __init__(self, referee: judge.Referee, started_us: int) -> None:
-        """Take the referee and the start of the episode [µs]."""
+    def __init__(self, referee: judge.Referee, started_us: int, *, lands: bool = False) -> None:
+        """Take the referee and the start of the episode [µs].
+
+        `lands`: a vehicle elsewhere still flies after a collision, and lands.
+        """
+        self._lands = lands
         self.referee = referee
         self.started_us = started_us
         """Start of the episode [µs]."""
@@ -92,7 +96,7 @@ class EpisodeSupervisor:
         if self._called_off:
             return None
         self._called_off = True
-        return Order.LAND if land else Order.ABANDON
+        return Order.LAND if land or self._lands else Order.ABANDON
 
 
 SEPARATED = (LINK_LOST, CAMERA_SILENT, TELEMETRY_FROZEN, FRAMES_LATE)
@@ -149,6 +153,9 @@ def join_episode(
     """Join both processes' outputs of a judged episode; the companion's log may be missing."""
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
+    if episode.loaded.poses:
+        # Nobody measures the power of a vehicle elsewhere.
+        trajectory.power_w[:] = np.nan
     latency = part_of(arrays, "estimate", keep_prefix=True)
     latency[run_folder.TICK_LATENESS] = arrays["tick/lateness_us"]
     if decisions_path.exists():

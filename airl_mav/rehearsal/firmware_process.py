@@ -181,6 +181,8 @@ class Service:
                 slipped_us=self._firmware.slipped_us,
                 goal=arena.goal_point,
                 firmware=self._firmware.flight_stack.version,
+                local_goal=self._firmware.flight_stack.local(arena.goal_point),
+                poses=self._firmware.flight_stack.title(),
             )
         )
 
@@ -235,7 +237,7 @@ def fly_requested(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     firmware = build_firmware(
         scenario.scenario,
         scenario.vehicle,
-        WallPacing(scenario.speed or 1.0),
+        WallPacing(scenario.speed or 1.0, programs.behind_us(scenario.scenario)),
         log=None if begin.log is None else Path(begin.log),
     )
     with ExitStack() as held:
@@ -282,7 +284,7 @@ def fly_vehicle(
     firmware = build_firmware(
         asked,
         vehicle,
-        Unpaced() if asked.pace is None else WallPacing(asked.pace),
+        Unpaced() if asked.pace is None else WallPacing(asked.pace, programs.behind_us(asked)),
         bind=asked.bind,
         companion_host=asked.companion_host,
         gcs_host=asked.gcs_host,
@@ -300,7 +302,7 @@ def fly_vehicle(
         if (hint := programs.how_to_start(asked, vehicle)) is not None:
             listener.waiting(hint)
         firmware.load(episode, asked.tlog, unix_us())
-        listener.ready(firmware.camera_endpoint, goal)
+        listener.ready(firmware.camera_endpoint, firmware.flight_stack.local(goal))
         for line in ports:
             listener.say(line)
         fly(firmware, stop, asked.duration, listener.say)

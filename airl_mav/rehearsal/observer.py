@@ -50,6 +50,9 @@ class Observer:
     def text(self, text: Text) -> None:
         """Called for a text of the autopilot."""
 
+    def poses(self, source: str) -> None:
+        """Called with the source of the poses of a vehicle elsewhere, at each flight."""
+
     def finished(self, record: EpisodeRecord) -> None:
         """Called when an episode has been saved."""
 
@@ -104,6 +107,10 @@ class LiveObserver(Observer):
         """Print an autopilot text of severity warning or worse."""
         if text.severity <= WARNING:
             self._progress.note(f"  autopilot: {text.text}", "yellow")
+
+    def poses(self, source: str) -> None:
+        """Print the source of the poses."""
+        self._progress.note(f"  poses: {source}; a collision only ends the flight")
 
     def finished(self, record: EpisodeRecord) -> None:
         """Print an episode's line and advance the bar."""

@@ -26,7 +26,7 @@ from airl_mav.rehearsal.episode import (
 )
 from airl_mav.rehearsal.observer import FLOWN_AGAIN, WARNING, Observer
 from airl_mav.scenario.resolve import ResolvedScenario
-from firmware_sim.external.programs import load_timeout_s
+from firmware_sim.external.programs import behind_us, load_timeout_s
 
 WRAP_UP_S = 90.0
 """Maximum time from the verdict to the companion's report, including landing [simulated s]."""
@@ -149,14 +149,18 @@ class Rehearsal:
             lambda event: self._look(event, known),
             load_timeout_s(scenario.scenario),
         )
-        supervisor = EpisodeSupervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
+        attached = behind_us(scenario.scenario) > 0
+        if attached and folder.note_poses(loaded.poses):
+            self._observer.poses(loaded.poses)
+        referee = Referee(scenario.task(loaded.goal))
+        supervisor = EpisodeSupervisor(referee, loaded.time_us, lands=attached)
         faults = process_pair.ProcessFaults(pair, self._speed)
         episode = RunningEpisode(index, seed, loaded, supervisor, WallClock(), faults, known)
         self._observer.episode(index, seed, loaded.goal)
         pair.send(
             process_pair.COMPANION,
             channel.Fly(
-                goal=loaded.goal,
+                goal=loaded.local_goal,
                 epoch_ns=loaded.epoch_ns,
                 seed=seed,
                 record=str(decisions_path.absolute()),

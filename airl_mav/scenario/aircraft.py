@@ -28,7 +28,7 @@ GREATEST_INSTANCE = 9
 
 EstimatorName = Literal["kernel", "filterpy"]
 PlantName = Literal["pybullet", "kernel"]
-FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
+FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl", "attach"]
 
 
 def _is_installed(package: str) -> bool:
@@ -100,6 +100,10 @@ class RealFirmware(ProfileModel):
         ge=0,
         le=GREATEST_INSTANCE,
         default=0,
+    )
+    connect: str | None = optional(
+        "with firmware attach: second MAVLink link of a vehicle that flies elsewhere, beside the"
+        " companion's: udpin://127.0.0.1:14550"
     )
     serial: str | None = optional(
         "with firmware px4-hitl: serial device of the board: /dev/ttyACM0"

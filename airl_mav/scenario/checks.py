@@ -34,6 +34,7 @@ REAL_FIRMWARE_NEEDS = {
     "px4": ("px4_dir", "px4_connect"),
     "ardupilot": ("ardupilot_dir", "ardupilot_connect"),
     "px4-hitl": ("serial",),
+    "attach": ("connect",),
 }
 """Each kind of real firmware requires exactly one of its fields."""
 
@@ -156,8 +157,10 @@ def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str |
             firmware,
             "at level sitl; at level lockstep only builtin and px4 share the companion's clock",
         )
-    if firmware == "px4-hitl" and speed not in (None, 1.0):
-        raise FieldError("speed", speed, "1 with firmware px4-hitl, a board's own pace")
+    if firmware in ("px4-hitl", "attach") and speed not in (None, 1.0):
+        raise FieldError("speed", speed, f"1 with firmware {firmware}, which has a pace of its own")
+    if firmware == "attach":
+        check_attached(asked)
     if firmware == "px4":
         usual = Ports()
         for name, value in asked.ports:
@@ -165,6 +168,26 @@ def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str |
                 raise FieldError(
                     f"ports.{name}", value, "its default: PX4 SITL's ports move with instance"
                 )
+
+
+NEED_PLANT = ("payload", "battery_charge", "wind", "spread", "faults")
+"""Fields that change a vehicle simulated here."""
+
+
+def check_attached(asked: Aircraft) -> None:
+    """Raise FieldError for a field that a vehicle elsewhere does not support."""
+    usual = Aircraft()
+    accepted = "its default with firmware attach, whose vehicle flies elsewhere"
+    for field in NEED_PLANT:
+        value = getattr(asked, field)
+        if value == getattr(usual, field):
+            continue
+        if isinstance(value, tuple):
+            raise FieldError(field, str(value[0]), accepted)
+        if isinstance(value, float):
+            raise FieldError(field, value, accepted)
+        name, inner = next(iter(value.model_dump(exclude_defaults=True).items()))
+        raise FieldError(f"{field}.{name}", inner, accepted)
 
 
 ACTION_STREAM = 1

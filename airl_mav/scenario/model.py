@@ -128,6 +128,13 @@ class LimitSettings(ProfileModel):
         le=60,
         default=0.5,
     )
+    drift_m: float = quantity(
+        "a position and a velocity that part by more within 5 s are rejected",
+        "m",
+        ge=0.5,
+        le=20,
+        default=1.0,
+    )
     radius_m: float | None = quantity(
         "maximum horizontal distance from the start; by default twice that of the goal plus 50 m",
         "m",

@@ -153,6 +153,7 @@ FIRMWARE_TITLES: dict[FirmwareName, str] = {
     "px4": "PX4 SITL",
     "ardupilot": "ArduPilot SITL",
     "px4-hitl": "PX4 on a board",
+    "attach": "vehicle elsewhere",
 }
 
 

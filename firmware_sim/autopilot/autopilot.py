@@ -119,6 +119,7 @@ class BuiltinAutopilot:
         self.on_setpoint: Callable[[autopilot_state.Wire, int], None] | None = None
         """Callback for accepted setpoints: setpoint as received, time of receipt [µs]."""
         self.on_message: Callable[[autopilot_state.OperatorText], None] | None = None
+        self.body_by = None
         """Callback for operator texts."""
         self._say_all(parameters.take_texts())
 

@@ -20,7 +20,7 @@ from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.external.parameters import GROUND_LOSS, differences
 from firmware_sim.external.programs import firmware_kind
 from firmware_sim.mavlink import link, px4_links, traffic
-from firmware_sim.mavlink.endpoint import UdpEndpoint
+from firmware_sim.mavlink.endpoint import Endpoint, UdpEndpoint
 
 ASK_EVERY_S = 0.25
 """Interval of repeated requests for missing parameters [wall s]."""
@@ -52,8 +52,7 @@ class FirmwareRequest:
 
 def real_firmware(request: FirmwareRequest) -> ExternalFlightStack:
     """Bind the ports of real firmware and return it, not yet started. Raises UsageError."""
-    launcher, endpoint = load(firmware_kind(request.aircraft.firmware).parts)(request)
-    observer = FirmwareObserver(endpoint, "observer", request.vehicle.told_origin)
+    launcher, observer = load(firmware_kind(request.aircraft.firmware).parts)(request)
     return ExternalFlightStack(launcher, observer, request.aircraft.real.firmware_timeout)
 
 
@@ -62,6 +61,11 @@ def instance_endpoint(local_port: int, remote_port: int | None = None) -> UdpEnd
     remote = None if remote_port is None else (LOOPBACK, remote_port)
     option = "--instance"
     return UdpEndpoint((LOOPBACK, local_port), remote, local_option=option, remote_option=option)
+
+
+def observed(request: FirmwareRequest, endpoint: Endpoint) -> FirmwareObserver:
+    """Return the observer of a vehicle's firmware on a link."""
+    return FirmwareObserver(endpoint, "observer", request.vehicle.told_origin)
 
 
 class ExternalFlightController:
@@ -78,6 +82,7 @@ class ExternalFlightController:
         self._sample: interfaces.SensorSample | None = None
         self.rate_hz = bridge.rate_hz
         self.use_truth = bridge.use_truth
+        self.body_by = launcher.body_by
 
     @property
     def on_message(self) -> Callable[[autopilot_state.OperatorText], None] | None:
@@ -104,17 +109,18 @@ class ExternalFlightController:
         )
 
     def close(self) -> None:
-        """Stop firmware started here; otherwise command it to reboot or shut down."""
-        if not self._launcher.may_set:
-            self._send_shutdown()
+        """Stop firmware started here; otherwise command its end, if it has to end."""
+        farewell = self._launcher.farewell
+        if farewell is not None and not self._launcher.may_set:
+            self._send_shutdown(farewell)
         self._launcher.stop()
 
-    def _send_shutdown(self) -> None:
+    def _send_shutdown(self, farewell: int) -> None:
         """Send the command and continue to simulate until it has taken effect."""
         sample, self._sample = self._sample, None
         if sample is None:
             return
-        self._observer.end(reboot=self._launcher.reboots)
+        self._observer.end(farewell)
         period_us = US_PER_S // self.rate_hz
         with suppress(interfaces.FirmwareLostError):
             for _ in range(round(FAREWELL_S * self.rate_hz)):
@@ -149,6 +155,7 @@ class ExternalFlightStack:
         self.filenos = observer.filenos
         self._look_every_us, self._look_us = look_every_us, 0
         self.send = observer.send
+        self.local, self.title = launcher.local, launcher.title
         self.counters: Callable[[], dict[str, link.LinkCounters]] = observer.counters
 
     def next_send_us(self) -> float:

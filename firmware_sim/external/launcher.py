@@ -15,8 +15,13 @@ from typing import Protocol
 import psutil
 
 from airl_mav.core import child_process, clock, files
+from airl_mav.core.frames import Goal
 from firmware_sim import interfaces
 from firmware_sim.external.parameters import RequiredAirframe
+from firmware_sim.plant.body import PlantBody
+
+REBOOT, SHUT_DOWN = 1, 2
+"""First parameter of PREFLIGHT_REBOOT_SHUTDOWN."""
 
 
 def no_process() -> None:
@@ -68,20 +73,26 @@ class Launcher:
         bridge: Callable[[], Bridge],
         timeout_s: float,
         *,
-        reboots: bool = True,
+        farewell: int | None = REBOOT,
         program: Callable[[Path], StartCommand] | None = None,
         folders: WorkingFolders | None = None,
     ) -> None:
         """Configure the launch; `bridge` opens the simulator interface for one flight.
 
-        `timeout_s` is the connection timeout [wall s]; `reboots`: the firmware reboots on command.
-        `program` writes files to an empty working folder and returns the command to run there;
-        None = the user starts the firmware.
+        `timeout_s` is the connection timeout [wall s]. `farewell` ends the user's firmware after a
+        flight: `REBOOT`, `SHUT_DOWN`, None = it keeps running. `program` writes files to an empty
+        working folder and returns the command to run there; None = the user starts the firmware.
         """
         self.airframe = airframe
         self.may_set = program is not None
         """True if parameters may be changed: the firmware was started here for this flight."""
-        self.reboots = reboots
+        self.farewell = farewell
+        self.body_by: Callable[..., PlantBody] | None = None
+        """Factory of a body that moves elsewhere, see `plant.new_body`; None = a simulated one."""
+        self.local: Callable[[Goal], Goal] = lambda goal: goal
+        """Return a goal of the arena in the firmware's local frame."""
+        self.title: Callable[[], str] = lambda: ""
+        """Return the source of the poses of a body that moves elsewhere."""
         self._open_bridge = bridge
         self._program, self._folders = program, folders
         self._timeout_s = timeout_s

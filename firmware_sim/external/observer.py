@@ -83,9 +83,6 @@ BEAT_EVERY_US = 1_000_000
 FORCE = 21196
 """Second parameter of COMPONENT_ARM_DISARM: disarm in any state (MAVLink, common.xml)."""
 
-REBOOT, SHUT_DOWN = 1, 2
-"""First parameter of PREFLIGHT_REBOOT_SHUTDOWN."""
-
 
 def _origin_message(origin: Geodetic, system_id: int) -> Any:
     return dialect.MAVLink_set_gps_global_origin_message(
@@ -101,6 +98,8 @@ _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 class FirmwareObserver:
     """Link to external firmware. Non-blocking; no received message raises."""
+
+    intervals_us: Mapping[str, int] = INTERVALS_US
 
     def __init__(self, endpoint: Endpoint, name: str, origin: Geodetic | None = None) -> None:
         """Observe a named link; `origin` is sent to firmware without GPS."""
@@ -201,14 +200,15 @@ class FirmwareObserver:
             # PX4 boots into Hold and cannot arm there without an origin. An origin sent before PX4
             # has estimated a position would shift that position.
             self._send(_origin_message(self._origin, self._heard.get_srcSystem()))
-        for name, interval_us in (INTERVALS_US if self._origin is None else WITHOUT_GPS).items():
+        wanted = self.intervals_us if self._origin is None else WITHOUT_GPS
+        for name, interval_us in wanted.items():
             if name not in self._came:
                 self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us)
 
-    def end(self, *, reboot: bool) -> None:
-        """Command the firmware to stop the motors, then to reboot or shut down."""
+    def end(self, action: int) -> None:
+        """Command the firmware to stop the motors, then to reboot or shut down (`launcher`)."""
         self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
-        self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, REBOOT if reboot else SHUT_DOWN)
+        self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, action)
 
     def log_to(self, tlog: TlogWriter | None) -> None:
         """Start to log both directions to a tlog; None stops logging."""

@@ -27,7 +27,9 @@ class FirmwareKind:
     parameter_file: Callable[[Mapping[str, parameters.Value]], str]
     """Return a file with parameters for the firmware's tools."""
     parts: str
-    """Function that binds the ports of a `flight_stack.Wanted`, as `module:name`."""
+    """Function that binds the ports of a `flight_stack.FirmwareRequest`, as `module:name`."""
+    behind_us: int = 0
+    """Delay of ticks that follow a vehicle elsewhere [µs]; 0 = the vehicle is simulated here."""
     check_program: Callable[[RealFirmware], object] = lambda _real: None
     """Find the program to start. Raises UsageError if it does not exist."""
     how_to_start: Callable[[Aircraft, VehicleProfile], str | None] = lambda _asked, _vehicle: None
@@ -49,6 +51,11 @@ def check_program(aircraft: Aircraft) -> None:
     """Find the program to start. Raises UsageError if it does not exist."""
     if aircraft.firmware != "builtin":
         firmware_kind(aircraft.firmware).check_program(aircraft.real)
+
+
+def behind_us(aircraft: Aircraft) -> int:
+    """Return the delay of ticks that follow a vehicle elsewhere [µs]; 0 = simulated here."""
+    return 0 if aircraft.firmware == "builtin" else firmware_kind(aircraft.firmware).behind_us
 
 
 def load_timeout_s(aircraft: Aircraft) -> float | None:

@@ -176,16 +176,16 @@ def _instance(request: flight_stack.FirmwareRequest, instance: int) -> Conducted
         for each in newest:
             each.settle()
 
-    launcher, endpoint = px4_sitl.px4_parts(request, instance, bridge)
+    launcher, watching = px4_sitl.px4_parts(request, instance, bridge)
     try:
         link = OnboardLink(instance, alive)
     except errors.UsageError:
-        endpoint.close()
+        watching.close()
         launcher.close()
         raise
     stack = flight_stack.ExternalFlightStack(
         launcher,
-        observer.FirmwareObserver(endpoint, "observer", request.vehicle.told_origin),
+        watching,
         request.aircraft.real.firmware_timeout,
         on_close=link.close,
         look_every_us=LOOK_US,

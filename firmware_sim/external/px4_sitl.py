@@ -20,14 +20,15 @@ from firmware_sim import interfaces
 from firmware_sim.external import flight_stack, parameters, programs
 from firmware_sim.external import hil_messages as hil
 from firmware_sim.external.launcher import (
+    SHUT_DOWN,
     Launcher,
     RunningProgram,
     WorkingFolders,
     no_process,
     program_at,
 )
+from firmware_sim.external.observer import FirmwareObserver
 from firmware_sim.mavlink.codec import Decoder, Encoder, Values, WireLayout, WireMessage, dialect
-from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.streams.status import hil_state_quaternion
 
 WATCH_S = 0.1
@@ -464,8 +465,8 @@ def px4_parts(
     request: flight_stack.FirmwareRequest,
     instance: int | None = None,
     bridge: Callable[[int], Px4Bridge] = Px4Bridge,
-) -> tuple[Launcher, Endpoint]:
-    """Bind the observer's end of PX4's payload link. Return PX4's launcher and this endpoint.
+) -> tuple[Launcher, FirmwareObserver]:
+    """Bind PX4's payload link. Return PX4's launcher and the observer on this link.
 
     `instance` shifts the ports; None = the requested instance, whose ports must be free. `bridge`
     opens the simulator interface on a port.
@@ -485,8 +486,8 @@ def px4_parts(
         airframe,
         partial(bridge, programs.SIMULATOR_PORT + instance),
         options.firmware_timeout,
-        reboots=False,
+        farewell=SHUT_DOWN,
         program=None if program is None else partial(program.start, instance, airframe.autostart),
         folders=WorkingFolders("px4", options.firmware_dir, request.log),
     )
-    return launcher, endpoint
+    return launcher, flight_stack.observed(request, endpoint)

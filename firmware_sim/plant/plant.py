@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -106,6 +108,7 @@ class Plant:
         airframe: Airframe | None = None,
         rate_hz: int = constants.TICK_HZ,
         computer_w: float = 0.0,
+        body_by: Callable[..., PlantBody] | None = None,
     ) -> None:
         """Place the vehicle at rest on the floor at the start, facing north.
 
@@ -118,6 +121,7 @@ class Plant:
             airframe: Airframe of this vehicle; None = from the profile.
             rate_hz: Tick rate [Hz].
             computer_w: Power of the onboard computer from the pack [W].
+            body_by: Factory of a body that moves elsewhere; None = a simulated one.
         """
         tick_s = 1.0 / rate_hz
         asked = aircraft or Aircraft()
@@ -146,7 +150,8 @@ class Plant:
         self.rotor_lag = lag(airframe, tick_s)
         """Fraction of a rotor speed error that remains after a tick."""
         pack, power_w = dynamics.pack_row(profile.battery), standing_power_w(0.0, airframe, model)
-        self.body: PlantBody = new_body(asked.plant, arena, profile.body, airframe, tick_s)
+        make = body_by or partial(new_body, asked.plant)
+        self.body: PlantBody = make(arena, profile.body, airframe, tick_s)
         """Vehicle body among the bodies of the arena."""
         self._room = Room(arena, profile.body)
         # All names are fields of `engine.record.AIRCRAFT`.

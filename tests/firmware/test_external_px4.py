@@ -46,6 +46,7 @@ class Flown:
 
     on_message: Callable[[OperatorText], None] | None = None
     internals = None
+    body_by = None
     flight = CommanderState()
 
     def __init__(self, bridge: Px4Bridge) -> None:

@@ -32,6 +32,7 @@ class Witness:
 
     rate_hz = 250
     internals = None
+    body_by = None
 
     def __init__(self, motor: float = 0.0) -> None:
         self.on_message: Callable[[OperatorText], None] | None = None

@@ -24,6 +24,7 @@ class BridgeOnly:
 
     on_message: Callable[[OperatorText], None] | None = None
     internals = None
+    body_by = None
 
     def __init__(self, bridge: ArdupilotBridge) -> None:
         self.rate_hz = bridge.rate_hz

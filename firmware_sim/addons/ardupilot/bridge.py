@@ -27,7 +27,8 @@ from firmware_sim.addons.ardupilot.program import (
 )
 from firmware_sim.external import flight_stack, parameters
 from firmware_sim.external.launcher import Launcher, WorkingFolders, no_process
-from firmware_sim.mavlink.endpoint import Address, Endpoint
+from firmware_sim.external.observer import FirmwareObserver
+from firmware_sim.mavlink.endpoint import Address
 
 MAGIC_16, MAGIC_32 = 18_458, 29_569
 """First word of a packet with 16 servo channels and with 32 (SERVO_32_ENABLE = 1)."""
@@ -286,8 +287,8 @@ def _motors(pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
     return a, b, c, d
 
 
-def ardupilot_parts(request: flight_stack.FirmwareRequest) -> tuple[Launcher, Endpoint]:
-    """Bind the observer's port. Return ArduPilot's launcher and this endpoint."""
+def ardupilot_parts(request: flight_stack.FirmwareRequest) -> tuple[Launcher, FirmwareObserver]:
+    """Bind the observer's port. Return ArduPilot's launcher and the observer."""
     options, ports, vehicle = request.aircraft.real, request.aircraft.ports, request.vehicle
     instance, folder = options.instance, options.ardupilot_dir
     airframe = ardupilot_airframe(vehicle)
@@ -305,4 +306,4 @@ def ardupilot_parts(request: flight_stack.FirmwareRequest) -> tuple[Launcher, En
         else partial(start, program, instance, links, airframe.settings),
         folders=WorkingFolders("ardupilot", options.firmware_dir, request.log),
     )
-    return launcher, endpoint
+    return launcher, flight_stack.observed(request, endpoint)

@@ -28,7 +28,6 @@ from firmware_sim.addons.px4_hitl.line import (
 from firmware_sim.external import flight_stack, launcher, observer, parameters, programs
 from firmware_sim.external import hil_messages as hil
 from firmware_sim.mavlink.codec import Encoder, Values, WireLayout, WireMessage, dialect
-from firmware_sim.mavlink.endpoint import Endpoint
 
 HIL_SETUP = "set SYS_HITL = 1 with the airframe HIL Quadcopter X (SYS_AUTOSTART 1001) and reboot it"
 
@@ -511,8 +510,10 @@ class HitlBridge:
             self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
 
 
-def px4_hitl_parts(request: flight_stack.FirmwareRequest) -> tuple[launcher.Launcher, Endpoint]:
-    """Bind the clients' ports. Return the launcher for the board, and the observer's endpoint."""
+def px4_hitl_parts(
+    request: flight_stack.FirmwareRequest,
+) -> tuple[launcher.Launcher, observer.FirmwareObserver]:
+    """Bind the clients' ports. Return the launcher for the board, and its observer."""
     options = request.aircraft.real
     airframe = parameters.px4_airframe(request.vehicle, parameters.HITL_OUTPUT)
     parameters.refuse_untold(request.vehicle, "px4-hitl")
@@ -522,7 +523,11 @@ def px4_hitl_parts(request: flight_stack.FirmwareRequest) -> tuple[launcher.Laun
     except UsageError:
         router.close()
         raise
-    return launcher.Launcher(airframe, partial(HitlBridge, link), options.firmware_timeout), router
+    bridge = partial(HitlBridge, link)
+    return (
+        launcher.Launcher(airframe, bridge, options.firmware_timeout),
+        flight_stack.observed(request, router),
+    )
 
 
 PX4_HITL = programs.FirmwareKind(
