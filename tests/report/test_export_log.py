@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,6 @@ from airl_mav.arena.generate import generate
 from airl_mav.black_box.mcap_file import BlackBoxFile, read_black_box
 from airl_mav.black_box.messages import Decision, End, Latency, Phase, Telemetry
 from airl_mav.cli import options as cli_options
-from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS
@@ -500,71 +497,6 @@ def test_a_row_knows_its_fields() -> None:
         attitude.rows([1], {"q": [1.0, 0.0, 0.0]})
 
 
-# --- live
-
-
-@pytest.fixture
-def live(gym: Path) -> Iterator[Any]:
-    pytest.importorskip("foxglove", reason="needs the [export] extra")
-    from airl_mav.addons.export_log.mcap_export import LiveFlight
-
-    served = LiveFlight(recorded(gym), 0)
-    yield served
-    served.close()
-
-
-def subscribed(port: int) -> tuple[Any, dict[int, str]]:
-    """Connect and subscribe to all topics as Foxglove does; return socket and topics by id."""
-    client = pytest.importorskip("websockets.sync.client")
-    socket = client.connect(
-        f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None
-    )
-    topics: dict[int, str] = {}
-    while not topics:
-        heard = json.loads(socket.recv(timeout=20))
-        if heard["op"] == "advertise":
-            topics = {each["id"]: each["topic"] for each in heard["channels"]}
-    asked = [{"id": number, "channelId": number} for number in topics]
-    socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
-    return socket, topics
-
-
-def heard_until(socket: Any, topics: dict[int, str], last: str) -> dict[str, list[int]]:
-    """Return the times [ns] of the messages by topic, until one of `last` has come."""
-    times: dict[str, list[int]] = {topic: [] for topic in topics.values()}
-    while not times[last]:
-        message = socket.recv(timeout=20)
-        if isinstance(message, bytes) and message[0] == 1:
-            _, number, time_ns = struct.unpack_from("<BIQ", message)
-            times[topics[number]].append(time_ns)
-    return times
-
-
-def test_a_flight_is_published_whole(live: Any, gym: Path) -> None:
-    run = load(gym)
-    assert not live.wait(0.0)
-    socket, topics = subscribed(live.port)
-    with socket:
-        assert live.wait(20.0)
-        clock = SimClock()
-        live.play(clock)
-        # It took as long as the flight.
-        assert clock.time_us() == int(run.trajectories[0].time_us[-1])
-        times = heard_until(socket, topics, "/end")
-        assert times["/scene/arena"]
-        assert times["/tf"] == sorted(times["/tf"])
-        # A client that connects after the end receives static content and the last pose.
-        late, known = subscribed(live.port)
-        with late:
-            seen = heard_until(late, known, "/scene/arena")
-            assert len(seen["/scene/arena"]) == 1
-
-
-def test_a_taken_port_is_one_line(live: Any, gym: Path) -> None:
-    with pytest.raises(UsageError, match=f"--port {live.port}: it is taken"):
-        airl("export_log", str(gym), "0", "--stream", "--port", str(live.port))
-
-
 # --- what cannot be done
 
 
@@ -572,7 +504,6 @@ def test_a_taken_port_is_one_line(live: Any, gym: Path) -> None:
     ("words", "line"),
     [
         (["7"], "FLIGHTS 7: accepted: 0 to 1, as far as recorded"),
-        (["--stream"], "FLIGHTS 2: accepted: one flight, with --stream"),
         (["--format", "csv"], None),
     ],
 )

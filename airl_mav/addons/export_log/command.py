@@ -1,4 +1,4 @@
-"""`airl export-log`: export flights of a run to log files, or stream them to Foxglove."""
+"""`airl export-log`: export flights of a run to log files."""
 
 from __future__ import annotations
 
@@ -14,31 +14,24 @@ from airl_mav.addons.export_log import recorded, ulog_log
 from airl_mav.addons.view.replayed_flight import ReplayedRun
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.shared_options import TrustArenas, folder_of
-from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.errors import FieldError, usage_errors
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel
 from airl_mav.core.files import open_regular, replacing
 from airl_mav.core.progress import RichProgress, new_console
 from airl_mav.rehearsal.run_folder import load, trust_arenas
-from airl_mav.scenario.aircraft import GREATEST_PORT
 from firmware_sim.interfaces import ULOG_SUFFIX
 
 Format = Literal["mcap", "ulog"]
-
-FOXGLOVE_PORT = 8765
-"""Default port of Foxglove's connections."""
 
 
 class ExportLogOptions(ProfileModel):
     """Write flights of a run as MCAP (Foxglove, rerun) or ULog (PlotJuggler, Flight Review).
 
-    Writes one file per flight, flight-NNN.mcap or flight-NNN.ulg. --stream publishes a flight in
-    real time instead, for Foxglove's "open connection"; Ctrl-C ends it.
+    Writes one file per flight, flight-NNN.mcap or flight-NNN.ulg.
 
     Examples:
         airl export-log runs/20261122T101530Z-sitl-static-obstacles
         airl export-log runs/A 3 7 --format ulog --out logs
-        airl export-log runs/A 7 --stream
     """
 
     run: Annotated[Path, POSITIONAL] = Field(
@@ -51,10 +44,6 @@ class ExportLogOptions(ProfileModel):
     out: Path | None = Field(
         default=None, description="folder of the files; by default that of the run"
     )
-    stream: bool = Field(
-        default=False, description="publish one flight live on the loopback address, write nothing"
-    )
-    port: int = quantity("TCP port of --stream", "1", ge=1, le=GREATEST_PORT, default=FOXGLOVE_PORT)
     trust: TrustArenas = False
 
 
@@ -63,9 +52,9 @@ READS_FILES = True
 
 
 def run(options: ExportLogOptions, console: Console | None = None) -> int:
-    """Write the files, or stream until Ctrl-C; return 0."""
+    """Write the files; return 0."""
     console = console or new_console()
-    if options.stream or options.format == "mcap":
+    if options.format == "mcap":
         check_installed("export")
     folder = folder_of(options.run)
     if options.trust:
@@ -74,8 +63,6 @@ def run(options: ExportLogOptions, console: Console | None = None) -> int:
     numbers = options.flights or tuple(sorted(record.index for record in replayed.records))
     for number in numbers:
         _check_recorded(replayed, number)
-    if options.stream:
-        return _stream(replayed, numbers, options.port, console)
     out = options.out or folder
     with usage_errors(f"--out {out}"):
         out.mkdir(parents=True, exist_ok=True)
@@ -94,28 +81,6 @@ def _check_recorded(run: ReplayedRun, number: int) -> None:
         run.record(number)
     except FieldError as error:
         raise FieldError("flights", number, error.accepted) from None
-
-
-def _stream(run: ReplayedRun, numbers: tuple[int, ...], port: int, console: Console) -> int:
-    if len(numbers) != 1:
-        raise FieldError("flights", len(numbers), "one flight, with --stream")
-    # Imported here: the streaming server is an extra.
-    from airl_mav.addons.export_log.mcap_export import LiveFlight
-
-    live = LiveFlight(flight_of(run, numbers[0]), port)
-    try:
-        console.print(
-            f"stream  ws://{LOOPBACK}:{live.port}  (begins when Foxglove connects)",
-            soft_wrap=True,
-            highlight=False,
-        )
-        console.file.flush()
-        live.run(lambda: console.print("again from the beginning", highlight=False))
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        live.close()
-    return 0
 
 
 def flight_of(run: ReplayedRun, index: int) -> recorded.RecordedFlight:

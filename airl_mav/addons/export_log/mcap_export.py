@@ -1,19 +1,16 @@
-"""Messages of a flight, in an MCAP file or on a live Foxglove server."""
+"""Messages of a flight, in an MCAP file."""
 
 from __future__ import annotations
 
 import heapq
-import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import foxglove
 import numpy as np
 from foxglove import messages
-from foxglove.websocket import ChannelView, Client, ServerListener
 from numpy.typing import NDArray
 
 from airl_mav.addons.export_log.recorded import RecordedFlight, charge_of, decision_messages
@@ -52,9 +49,8 @@ from airl_mav.black_box.messages import (
     encoded,
     text,
 )
-from airl_mav.core.clock import NS_PER_US, Clock, WallClock, since_1970_us
-from airl_mav.core.constants import LOOPBACK, US_PER_MS
-from airl_mav.core.errors import FieldError
+from airl_mav.core.clock import since_1970_us
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import replacing
 from airl_mav.core.frames import frd_to_flu, quat_flu_from_optical
 from airl_mav.flight.trajectory import Trajectory, commanded_velocity
@@ -63,103 +59,6 @@ from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.projections import CameraKind
 from airl_mav.rehearsal.run_folder import info_data
 from airl_mav.report import policy_view, scene
-
-PAUSE_US = 2_000_000
-"""Pause between repetitions of a flight [wall µs]."""
-
-
-SETTLED_S = 0.3
-"""Time without a new subscription after which a viewer's subscriptions are complete [wall s]."""
-
-
-BACKLOG = 1024
-"""Minimum queue length per viewer (Foxglove's default); the oldest messages are dropped first."""
-
-
-class LiveFlight(ServerListener):
-    """Server that starts playback with its first viewer; later ones get the newest messages."""
-
-    def __init__(self, flight: RecordedFlight, port: int) -> None:
-        """Serve on a loopback TCP port, 0 = any free port; raise FieldError if it is in use."""
-        messages = FlightMessages(flight)
-        self._began_unix_us = messages.began_unix_us
-        self._told = list(messages)
-        self._context = foxglove.Context()
-        self._channels: dict[Channel, foxglove.Channel] = {}
-        self._newest: dict[int, tuple[foxglove.Channel, bytes, int]] = {}
-        """Newest message by channel number: channel, data, time [ns]."""
-        self._lock = threading.Lock()
-        self._watched, self._another = threading.Event(), threading.Event()
-        for each in dict.fromkeys(message.channel for message in self._told):
-            self._channels[each] = self._new(each)
-        try:
-            self._server = foxglove.start_server(
-                name="airl export-log",
-                host=LOOPBACK,
-                port=port,
-                server_listener=self,
-                context=self._context,
-                # Room for all messages: a slow viewer must not lose the scene, which is sent once.
-                message_backlog_size=max(BACKLOG, len(self._told)),
-            )
-        except RuntimeError:
-            raise FieldError("port", port, problem="it is taken; accepted: a free one") from None
-        self.port = int(self._server.port)
-        """TCP port of the server."""
-
-    def _new(self, channel: Channel) -> foxglove.Channel:
-        schema = foxglove.Schema(
-            name=channel.schema_name, encoding=channel.schema_encoding, data=channel.schema
-        )
-        return foxglove.Channel(
-            channel.topic, schema=schema, message_encoding=channel.encoding, context=self._context
-        )
-
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
-        """Resend the newest message of the channel; called from the server's thread."""
-        with self._lock:
-            if (newest := self._newest.get(channel.id)) is not None:
-                newest[0].log(newest[1], log_time=newest[2])
-        self._another.set()
-        self._watched.set()
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until a viewer has subscribed to its topics; return False on timeout."""
-        if not self._watched.wait(timeout_s):
-            return False
-        while self._another.wait(SETTLED_S):
-            self._another.clear()
-        return True
-
-    def play(self, clock: Clock | None = None) -> None:
-        """Publish the flight once from start to end."""
-        clock = clock or WallClock()
-        later_us = clock.time_us() - self._told[0].time_us
-        for message in self._told:
-            clock.sleep_until(message.time_us + later_us)
-            time_ns = (self._began_unix_us + message.time_us) * NS_PER_US
-            channel = self._channels[message.channel]
-            with self._lock:
-                self._newest[channel.id()] = channel, message.data, time_ns
-                channel.log(message.data, log_time=time_ns)
-
-    def run(self, ended: Callable[[], None], clock: Clock | None = None) -> None:
-        """Publish the flight repeatedly until interrupted; `ended` is called after each."""
-        clock = clock or WallClock()
-        while not self.wait(0.5):
-            pass
-        while True:
-            self.play(clock)
-            ended()
-            clock.sleep_until(clock.time_us() + PAUSE_US)
-            with self._lock:
-                self._newest.clear()
-            # Time restarts: viewers must discard their data.
-            self._server.clear_session()
-
-    def close(self) -> None:
-        """Free the port."""
-        self._server.stop()
 
 
 def write_mcap(flight: RecordedFlight, path: Path) -> None:
