@@ -10,16 +10,15 @@ from __future__ import annotations
 import re
 import select
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from airl_mav.arena.geometry import Arena
 from airl_mav.core import constants, errors, frames
 from airl_mav.core.clock import WallClock
-from airl_mav.profiles.vehicle import CORNERS, BodyProfile
-from airl_mav.vehicle.airframe import Airframe
+from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim import interfaces
 from firmware_sim.addons.kernel_plant.ground_contact import FLOOR_ID
@@ -39,7 +38,7 @@ POSE_US = 10_000
 """Requested interval of poses [µs]."""
 
 AHEAD_US = 200_000
-"""Maximum time by which a pose is extrapolated [µs]; then the vehicle stands still."""
+"""Maximum time by which a pose is extrapolated [µs]; then the vehicle stops."""
 
 LATE_US = 12_000
 """Maximum delay of a pose without a time after the newest message with one [µs]."""
@@ -65,7 +64,6 @@ HOLD = 4, 3
 _URL = re.compile(r"udpin://([^:/]+):(\d+)")
 _LISTEN_S = 0.02
 
-TRUE_STATES = "HIL_STATE_QUATERNION", "SIM_STATE"
 ESTIMATE = "ATTITUDE_QUATERNION"
 SOURCES = {
     "HIL_STATE_QUATERNION": "true state (HIL_STATE_QUATERNION)",
@@ -74,11 +72,10 @@ SOURCES = {
 }
 """Messages with poses and their titles, best first."""
 
-TELEMETRY = {
-    **observer.INTERVALS_US,
-    **dict.fromkeys((*SOURCES, "LOCAL_POSITION_NED"), POSE_US),
-}
+POSES = {*SOURCES, "LOCAL_POSITION_NED"}
+TELEMETRY = {**observer.INTERVALS_US, **dict.fromkeys(POSES, POSE_US)}
 
+_EULER_RATES = "rollspeed", "pitchspeed", "yawspeed"
 _POSITION, _VELOCITY, _ATTITUDE, _RATES = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 
 
@@ -145,51 +142,33 @@ class VehicleTelemetry(observer.FirmwareObserver):
             # Request also the rate of messages that come unrequested.
             self._came.clear()
         name = message.get_type()
-        if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+        if name not in POSES or message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return taken
         if name == "LOCAL_POSITION_NED":
-            self._local = (
-                int(message.time_boot_ms) * constants.US_PER_MS,
-                _row(message, "x", "y", "z", "vx", "vy", "vz"),
-            )
+            self._local = _us(message), _row(message, "x", "y", "z", "vx", "vy", "vz")
         elif name == ESTIMATE:
-            self._take_attitude(message)
-        elif name in TRUE_STATES:
-            self._take_truth(name, message)
-        else:
-            return taken
+            self.clock.hear(_us(message), self._now_us)
+            if self._local is not None:
+                at_us, moved = self._local
+                ahead_s = (_us(message) - at_us) / constants.US_PER_S
+                place, velocity = moved[:3] + ahead_s * moved[3:], moved[3:]
+                turn = _row(message, "q1", "q2", "q3", "q4", *_EULER_RATES)
+                self._add(name, _us(message), np.concatenate([place, velocity, turn]))
+        elif (newest_us := self.clock.newest_us) is not None:
+            point, motion = _truth(name, message)
+            self._zero = self._zero or point
+            row = np.concatenate([frames.geodetic_to_local(point, self._zero), motion])
+            time_us = min(self.clock.at(self._now_us), newest_us + LATE_US)
+            self._add(name, max(time_us, newest_us), row)
         return True
 
-    def _take_attitude(self, message: WireMessage) -> None:
-        time_us = int(message.time_boot_ms) * constants.US_PER_MS
-        self.clock.hear(time_us, self._now_us)
-        if self._local is not None:
-            at_us, local = self._local
-            ahead_s = (time_us - at_us) / constants.US_PER_S
-            position = local[:3] + ahead_s * local[3:]
-            turn = _row(message, "q1", "q2", "q3", "q4", "rollspeed", "pitchspeed", "yawspeed")
-            self._add(ESTIMATE, time_us, np.concatenate([position, local[3:], turn]))
-
-    def _take_truth(self, name: str, message: WireMessage) -> None:
-        if self.clock.newest_us is None:
-            return
-        time_us = int(getattr(message, "time_usec", 0))
-        if time_us == 0:
-            newest_us = self.clock.newest_us
-            time_us = min(max(self.clock.at(self._now_us), newest_us), newest_us + LATE_US)
-        place, motion = _truth(name, message)
-        self._zero = self._zero or place
-        position = frames.geodetic_to_local(place, self._zero)
-        self._add(name, time_us, np.concatenate([position, motion]))
-
     def _add(self, name: str, time_us: int, row: frames.Vector) -> None:
-        poses = self._poses[name]
-        size = np.linalg.norm(row[_ATTITUDE])
+        poses, turn = self._poses[name], row[_ATTITUDE]
+        size = np.linalg.norm(turn)
         if not np.isfinite(row).all() or size < 0.5 or (poses and time_us <= poses[-1][0]):
             return
-        row[_ATTITUDE] /= size
-        if poses and row[_ATTITUDE] @ poses[-1][1][_ATTITUDE] < 0.0:
-            row[_ATTITUDE] *= -1.0  # the nearer sign, for interpolation
+        # The nearer sign, for interpolation.
+        turn /= -size if poses and turn @ poses[-1][1][_ATTITUDE] < 0.0 else size
         poses.append((time_us, row))
         if name == self.source:
             self.silent_ticks = 0
@@ -253,24 +232,26 @@ class VehicleTelemetry(observer.FirmwareObserver):
         return row
 
 
-def pose_at(poses: deque[tuple[int, frames.Vector]], time_us: int) -> frames.Vector:
+def pose_at(poses: Sequence[tuple[int, frames.Vector]], time_us: int) -> frames.Vector:
     """Return the row (13,) of poses at a time [µs]: interpolated, or extrapolated by its rates."""
-    later: tuple[int, frames.Vector] | None = None
-    for pose in reversed(poses):
-        if pose[0] <= time_us:
+    later = None
+    for at_us, row in reversed(poses):
+        if at_us <= time_us:
             break
-        later = pose
-    at_us, row = pose
+        later = at_us, row
     if later is None:
         dt = min(time_us - at_us, AHEAD_US) / constants.US_PER_S
-        ahead = row.copy()
-        ahead[_POSITION] += dt * row[_VELOCITY]
         turn = np.array([1.0, *(0.5 * dt * row[_RATES])])
-        ahead[_ATTITUDE] = frames.quat_multiply(row[_ATTITUDE], turn)
-        return ahead
-    if later is pose:
-        return row.copy()
-    return row + (time_us - at_us) / (later[0] - at_us) * (later[1] - row)
+        turned = frames.quat_multiply(row[_ATTITUDE], turn)
+        return np.concatenate(
+            [row[_POSITION] + dt * row[_VELOCITY], row[_VELOCITY], turned, row[_RATES]]
+        )
+    share = max(0, time_us - at_us) / max(1, later[0] - at_us)
+    return row + share * (later[1] - row)
+
+
+def _us(message: WireMessage) -> int:
+    return int(message.time_boot_ms) * constants.US_PER_MS
 
 
 def _row(message: WireMessage, *fields: str) -> frames.Vector:
@@ -278,7 +259,7 @@ def _row(message: WireMessage, *fields: str) -> frames.Vector:
 
 
 def _truth(name: str, message: WireMessage) -> tuple[frames.Geodetic, frames.Vector]:
-    """Return place and velocity, attitude, rates (10,) of a true state."""
+    """Return place, and velocity, attitude and rates (10,), of a true state."""
     if name == "SIM_STATE":
         # The extension has the digits that 32 bits lack.
         exact = message.lat_int / 1e7, message.lon_int / 1e7
@@ -287,8 +268,8 @@ def _truth(name: str, message: WireMessage) -> tuple[frames.Geodetic, frames.Vec
         return place, _row(message, "vn", "ve", "vd", *turn)
     place = frames.Geodetic(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3)
     velocity = _row(message, "vx", "vy", "vz") / 1e2
-    rates = _row(message, "rollspeed", "pitchspeed", "yawspeed")
-    return place, np.concatenate([velocity, message.attitude_quaternion, rates])
+    turn = message.attitude_quaternion
+    return place, np.concatenate([velocity, turn, _row(message, *_EULER_RATES)])
 
 
 class AttachedBody(KernelBody):
@@ -303,11 +284,10 @@ class AttachedBody(KernelBody):
         """Move the body to the vehicle's pose and find its contacts; see `PlantBody`."""
         del at, force, torque, before
         told = self._vehicle.motion()
-        north, east, down = told[_POSITION].tolist()
-        parts = (told[each].tolist() for each in (_VELOCITY, _ATTITUDE, _RATES))
-        motion = self.put((north, east, down), *map(tuple, parts))
-        still = (0.0, 0.0, 0.0)
-        super().move((north, east, down), still, still, motion, moving_us)
+        parts: Any = (_POSITION, _VELOCITY, _ATTITUDE, _RATES)
+        here, *others = (tuple(told[each].tolist()) for each in parts)
+        motion, none = self.put(here, *others), (0.0, 0.0, 0.0)
+        super().move(here, none, none, motion, moving_us)
         if np.linalg.norm(told[_VELOCITY]) <= REST_SPEED_M_S:
             # The plant would keep a vehicle at rest on the floor there.
             floor = frozenset({FLOOR_ID})
@@ -345,7 +325,7 @@ class AttachedBridge:
         vehicle.place(self._half_height_m)
 
     def step(self, sample: interfaces.SensorSample) -> interfaces.ActuatorControls:
-        """Set the next tick; the motors of our vehicle stand still. Raises FirmwareLostError."""
+        """Set the next tick; the simulated motors are stopped. Raises FirmwareLostError."""
         vehicle = self._vehicle
         vehicle.tick_us = sample.time_us + constants.TICK_US
         vehicle.silent_ticks += 1
@@ -361,6 +341,10 @@ class AttachedBridge:
         """Do nothing: the vehicle keeps running."""
 
 
+_AIRFRAME = parameters.RequiredAirframe("vehicle", CORNERS, {}, {}, lambda _: None)
+"""Nothing is required: the vehicle is flown as it is."""
+
+
 def attach_parts(
     request: flight_stack.FirmwareRequest,
 ) -> tuple[Launcher, observer.FirmwareObserver]:
@@ -374,22 +358,19 @@ def attach_parts(
     vehicle = VehicleTelemetry(endpoint, "observer", request.vehicle.told_origin)
     half_height_m = 0.5 * request.vehicle.body.height_m
 
-    def body(arena: Arena | None, profile: BodyProfile, airframe: Airframe, tick_s: float) -> Any:
-        return AttachedBody(vehicle, arena, profile, airframe, tick_s)
-
     launcher = Launcher(
-        parameters.RequiredAirframe("vehicle", CORNERS, {}, {}, lambda _: None),
+        _AIRFRAME,
         lambda: AttachedBridge(vehicle, url, half_height_m),
         request.aircraft.real.firmware_timeout,
         farewell=None,
     )
-    launcher.body_by, launcher.local = body, vehicle.local
+    launcher.body_by, launcher.local = partial(AttachedBody, vehicle), vehicle.local
     launcher.title = lambda: SOURCES[vehicle.source]
     return launcher, vehicle
 
 
 ATTACH = programs.FirmwareKind(
-    airframe=lambda _: parameters.RequiredAirframe("vehicle", CORNERS, {}, {}, lambda _: None),
+    airframe=lambda _: _AIRFRAME,
     parameter_file=lambda _: "",
     parts=f"{__name__}:attach_parts",
     behind_us=BEHIND_US,
