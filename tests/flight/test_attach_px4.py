@@ -33,7 +33,7 @@ def test_two_flights_of_sih_from_where_it_stands(tmp_path: Path, px4_instance: i
     _, (camera,) = free_ports(0, 1)
     words = [
         *SITL,
-        *("--firmware", "attach", "--connect", "udpin://127.0.0.1:14550", "--drift-m", "3"),
+        *("--firmware", "attach", "--connect", "udpin://127.0.0.1:14550", "--limits.drift-m", "3"),
         *("--api-port", str(14_540 + px4_instance), "--camera-port", str(camera)),
         *("--policy", "static-obstacles", "--episodes", "2", "--no-validity", "--out", "run"),
     ]
