@@ -2,7 +2,7 @@
 
     AIRL_HITL_BOARD=board.py pytest tests/flight/test_hitl_px4.py
 
-The program `AIRL_HITL_BOARD LINK --instance N` runs PX4's nolockstep SITL with SYS_HITL 1, makes LINK
+`AIRL_HITL_BOARD LINK --instance N` runs PX4's nolockstep SITL with SYS_HITL 1, makes LINK
 a symbolic link to the host's end of its serial line, and restarts PX4 after a reboot.
 """
 
