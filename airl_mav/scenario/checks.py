@@ -170,24 +170,18 @@ def check_firmware(asked: Aircraft, level: model.LevelName, speed: float | str |
                 )
 
 
-NEED_PLANT = ("payload", "battery_charge", "wind", "spread", "faults")
+NEED_PLANT = {"payload", "battery_charge", "wind", "spread", "faults"}
 """Fields that change a vehicle simulated here."""
 
 
 def check_attached(asked: Aircraft) -> None:
     """Raise FieldError for a field that a vehicle elsewhere does not support."""
-    usual = Aircraft()
-    accepted = "its default with firmware attach, whose vehicle flies elsewhere"
-    for field in NEED_PLANT:
-        value = getattr(asked, field)
-        if value == getattr(usual, field):
-            continue
-        if isinstance(value, tuple):
-            raise FieldError(field, str(value[0]), accepted)
-        if isinstance(value, float):
-            raise FieldError(field, value, accepted)
-        name, inner = next(iter(value.model_dump(exclude_defaults=True).items()))
-        raise FieldError(f"{field}.{name}", inner, accepted)
+    for field, value in asked.model_dump(include=NEED_PLANT, exclude_defaults=True).items():
+        name, told = field, str(value)
+        if isinstance(value, dict):
+            name, told = next((f"{field}.{each}", f"{inner}") for each, inner in value.items())
+        accepted = "its default with firmware attach, whose vehicle flies elsewhere"
+        raise FieldError(name, told, accepted)
 
 
 ACTION_STREAM = 1

@@ -19,6 +19,7 @@ import numpy as np
 from airl_mav.core import constants, errors, frames
 from airl_mav.core.clock import WallClock
 from airl_mav.profiles.vehicle import CORNERS
+from airl_mav.scenario.aircraft import RealFirmware
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim import interfaces
 from firmware_sim.addons.kernel_plant.ground_contact import FLOOR_ID
@@ -27,7 +28,7 @@ from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.external import flight_stack, hil_messages, observer, parameters, programs
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.endpoint import UdpEndpoint
+from firmware_sim.mavlink.endpoint import Address, UdpEndpoint
 from firmware_sim.plant.plant import REST_SPEED_M_S
 
 BEHIND_US = 30_000
@@ -341,6 +342,14 @@ class AttachedBridge:
         """Do nothing: the vehicle keeps running."""
 
 
+def address_of(real: RealFirmware) -> Address:
+    """Return the address of the link to the vehicle. Raises FieldError."""
+    found = _URL.fullmatch(real.connect or "")
+    if found is None:
+        raise errors.FieldError("real.connect", real.connect, "udpin://HOST:PORT")
+    return found[1], int(found[2])
+
+
 _AIRFRAME = parameters.RequiredAirframe("vehicle", CORNERS, {}, {}, lambda _: None)
 """Nothing is required: the vehicle is flown as it is."""
 
@@ -349,12 +358,8 @@ def attach_parts(
     request: flight_stack.FirmwareRequest,
 ) -> tuple[Launcher, observer.FirmwareObserver]:
     """Bind the link to the vehicle. Return a launcher that starts nothing, and the observer."""
-    url = request.aircraft.real.connect or ""
-    found = _URL.fullmatch(url)
-    if found is None:
-        raise errors.FieldError("real.connect", url, "udpin://HOST:PORT")
-    option = "--connect"
-    endpoint = UdpEndpoint((found[1], int(found[2])), None, option, option)
+    url, option = request.aircraft.real.connect or "", "--connect"
+    endpoint = UdpEndpoint(address_of(request.aircraft.real), None, option, option)
     vehicle = VehicleTelemetry(endpoint, "observer", request.vehicle.told_origin)
     half_height_m = 0.5 * request.vehicle.body.height_m
 
@@ -373,5 +378,6 @@ ATTACH = programs.FirmwareKind(
     airframe=lambda _: _AIRFRAME,
     parameter_file=lambda _: "",
     parts=f"{__name__}:attach_parts",
+    check_program=address_of,
     behind_us=BEHIND_US,
 )
