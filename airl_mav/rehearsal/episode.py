@@ -154,7 +154,7 @@ def join_episode(
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
     if episode.loaded.poses:
-        # Nobody measures the power of a vehicle elsewhere.
+        # The power of a vehicle elsewhere is unknown.
         trajectory.power_w[:] = np.nan
     latency = part_of(arrays, "estimate", keep_prefix=True)
     latency[run_folder.TICK_LATENESS] = arrays["tick/lateness_us"]
