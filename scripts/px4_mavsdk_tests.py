@@ -350,7 +350,7 @@ def _raw(v: Vehicle, sequence: int, command: int, place: Place | None, **values:
     )
 
 
-@test("Fly Multicopter Mission with external set-current onto a DO_JUMP item")
+@test("Fly Multicopter Mission with external set-current onto a DO_JUMP item", since=(1, 18))
 def jump(v: Vehicle) -> None:
     """Select a DO_JUMP as the current item: the mission goes on to its landing."""
     ready(v)
@@ -728,6 +728,7 @@ def run(each: Px4Test, vehicle: Vehicle) -> dict[str, Any]:
     return {
         "name": each.name,
         "own": each.own,
+        "since": each.since,
         "passed": not problem,
         "finding": problem,
         "mode": vehicle.mode.name,
@@ -767,6 +768,7 @@ def main() -> int:
         parser.error(f"--connect {asked.connect}: cannot be used")
     companion = Companion(mavsdk)
     vehicle = Vehicle(companion, asked.system)
+    vehicle.until(lambda: vehicle.now_s > 0.0, 30.0)
     outcomes = []
     for name in asked.test or names:
         outcomes.append(run(names[name], vehicle))

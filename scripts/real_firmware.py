@@ -18,7 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
@@ -42,6 +42,8 @@ from firmware_sim.external.programs import check_free, firmware_kind
 
 ROOT = Path(__file__).resolve().parents[1]
 POLICIES = ("static-obstacles", "body-rates")
+ATTEMPTS = 3
+"""Maximum number of instances that are tried."""
 READY_S = 240.0
 """Timeout of a firmware's start [wall s]."""
 PART_S = 3600.0
@@ -170,11 +172,27 @@ def free_instance(first: int) -> int:
 @contextmanager
 def flying(command: Command, firmware: Firmware, speed: float) -> Iterator[Vehicle]:
     """Run a firmware with its vehicle in an open field. Raises PartError."""
-    folder = command.out / firmware.name
+    first = command.instance
+    with ExitStack() as held:
+        for left in reversed(range(ATTEMPTS)):
+            instance = free_instance(first)
+            try:
+                vehicle = held.enter_context(started(command, firmware, speed, instance))
+                break
+            except PartError:
+                # Another program may have taken the instance meanwhile.
+                first = instance + 1
+                if not left:
+                    raise
+        yield vehicle
+
+
+@contextmanager
+def started(command: Command, firmware: Firmware, speed: float, instance: int) -> Iterator[Vehicle]:
+    """Run a firmware on the ports of an instance. Raises PartError."""
+    folder, port = command.out / firmware.name, 14540 + instance
     log = folder / "firmware.log"
     log.unlink(missing_ok=True)
-    instance = free_instance(command.instance)
-    port = 14540 + instance
     argv = [
         *(sys.executable, "-m", "airl_mav.cli.firmware_command", "--arena", "open-field"),
         *("--instance", str(instance), "--speed", f"{speed:g}", *firmware.options),
@@ -463,9 +481,14 @@ def failed_checks(data: Results) -> list[str]:
     return [check["name"] for check in data["checks"] if check["outcome"] == "fail"]
 
 
-def failed_tests(data: Results) -> list[str]:
-    """Return the names of failed tests."""
-    return [each["name"] for each in data["tests"] if not each["passed"]]
+def tests_of(data: Results, number: int) -> dict[str, bool]:
+    """Return the tests of a release's behaviour, by name; True = passed."""
+    release = number >> 16
+    return {
+        each["name"]: each["passed"]
+        for each in data["tests"]
+        if each["since"][0] << 8 | each["since"][1] <= release
+    }
 
 
 def percent(estimate: Estimate) -> str:
@@ -506,15 +529,14 @@ def paired_rows(folder: Path, builtin: Path) -> list[Row]:
 
 def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) -> list[Row]:
     """Return the table's rows of one firmware, beside those of a built-in one."""
-    rows = []
-    if found := real.get("identity"):
-        other = builtin.get("identity")
-        title = "{version} ({git})"
-        text = title.format(**found)
-        rows.append(Row("version", text, title.format(**other) if other else ""))
+    if "identity" not in real:
+        return []
+    other, title = builtin.get("identity"), "{version} ({git})"
+    text, number = title.format(**real["identity"]), real["identity"]["number"]
+    rows = [Row("version", text, title.format(**other) if other else "")]
     if found := real.get("steps"):
         rows += step_rows(found["true"], builtin["steps"]["true"] if "steps" in builtin else None)
-        rows.append(judged_steps(found["estimated"], real["identity"]["number"]))
+        rows.append(judged_steps(found["estimated"], number))
     if found := real.get("paired"):
         for policy in found:
             folders = [out / each / f"paired-{policy}" for each in (name, beside)]
@@ -531,9 +553,10 @@ def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) 
         text = f"{same.agree} of {same.comparable} comparable calls agree ({share:.1f} %)"
         rows.append(Row("walk", text, f"{same.calls} calls"))
     if found := real.get("tests"):
-        other = builtin.get("tests")
-        failed = None if other is None else failed_tests(other)
-        rows.append(outcome_row("PX4's tests", failed_tests(found), failed, len(found["tests"])))
+        flown = [tests_of(each, number) for each in (found, builtin.get("tests")) if each]
+        failed = [[name for name, passed in each.items() if not passed] for each in flown]
+        beside_it = failed[1] if len(failed) > 1 else None
+        rows.append(outcome_row("PX4's tests", failed[0], beside_it, len(flown[0])))
     return rows
 
 

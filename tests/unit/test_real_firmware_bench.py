@@ -112,6 +112,17 @@ def test_the_built_in_one_has_the_nearest_release(bench: Any, tmp_path: Path) ->
     assert bench.builtin_for(tmp_path, bench.Firmware("copter", "ardupilot")).path is None
 
 
+def test_a_test_of_a_later_release_is_left_out(bench: Any) -> None:
+    data = {
+        "tests": [
+            {"name": "land", "passed": True, "since": [0, 0]},
+            {"name": "jump", "passed": False, "since": [1, 18]},
+        ]
+    }
+    assert bench.tests_of(data, 0x011100FF) == {"land": True}
+    assert bench.tests_of(data, 0x01120000) == {"land": True, "jump": False}
+
+
 @pytest.mark.parametrize("word", ["px4", "=/opt/px4", "a=", "builtin=/opt/px4"])
 def test_a_firmware_has_a_name_and_a_path(bench: Any, tmp_path: Path, word: str) -> None:
     with pytest.raises(UsageError, match="accepted: NAME=PATH"):
