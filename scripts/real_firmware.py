@@ -540,7 +540,7 @@ def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) 
     if found := real.get("paired"):
         for policy in found:
             folders = [out / each / f"paired-{policy}" for each in (name, beside)]
-            if all(folder.exists() for folder in folders):
+            if all((folder / "run.json").exists() for folder in folders):
                 rows += paired_rows(*folders)
     if found := real.get("conformance"):
         other = builtin.get("conformance")

@@ -43,6 +43,7 @@ SLOWEST, SLACK_S = 20.0, 10.0
 # MAVSDK repeats a command within 2 s of wall time; simulators have been seen to stall longer.
 COMMAND_ATTEMPTS = 5
 MODE_S = 3.0  # Timeout of a mode change; heartbeats come each second [s]
+ANOTHER_ACK_S = 0.1  # Maximum delay of a second acknowledgement [s]
 STREAM_PERIOD_S = 0.05  # Period of raw setpoints: 20 Hz, as in MAVSDK [s]
 
 # SET_POSITION_TARGET_LOCAL_NED.type_mask: each bit ignores a field.
@@ -137,7 +138,12 @@ class VehicleConnection:
     def set_mode(self, mode: tuple[int, int], note: str) -> int:
         """Request a mode, by DO_SET_MODE's parameters 2 and 3, and return the MAV_RESULT."""
         flags = checklist.CUSTOM_MODE_FLAG | (checklist.ARMED_FLAG if self.armed else 0)
-        return self.command(checklist.MavCommand.DO_SET_MODE, flags, *mode, note=note)
+        result = self.command(checklist.MavCommand.DO_SET_MODE, flags, *mode, note=note)
+        # PX4 1.16 and 1.17 accept the message first; the commander's answer follows.
+        self.wait(ANOTHER_ACK_S)
+        answer = self.telemetry.latest("COMMAND_ACK") or {}
+        again = answer.get("command") == checklist.MavCommand.DO_SET_MODE
+        return int(answer["result"]) if again else result
 
     def fly(self, setpoint: StepSetpoint) -> float:
         """Send a setpoint, repeated by MAVSDK at 20 Hz; return its arrival [s, vehicle time]."""
