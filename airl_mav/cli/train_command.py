@@ -5,35 +5,28 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.cli.shared_options import Telling, Viewing, Voice, view_of
+from airl_mav.cli.shared_options import Telling, Voice
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.rehearsal.live_view import ViewError, view_part
 from airl_mav.training.training_folder import Exported, TrainingProgress, TrainRequest
 
-if TYPE_CHECKING:
-    from airl_mav.rehearsal.live_view import ViewRequest
 
-
-class TrainOptions(Telling, TrainRequest, Viewing):
+class TrainOptions(Telling, TrainRequest):
     """Train a policy; the best weights are exported as policy.onnx with their card.
 
     Examples:
         airl train static-obstacles --out runs/mine
         airl train dense-obstacles --computer ras-pi-4 --workload template-5x32 --resume
         airl train my.toml --initial runs/mine --out runs/finer
-        airl train dynamic-obstacles --view
     """
 
     config: Annotated[str, POSITIONAL] = Field(
@@ -51,7 +44,6 @@ def run(
     """Train, export, and print the result; return 0, or 130 after Ctrl-C."""
     from airl_mav.envs.stopping import injections_of, speed_bound
 
-    asked = view_of(options)
     voice = Voice(options, "airl train", console)
     show = partial(voice.console.print, soft_wrap=True, highlight=False)
     config = options.configured()
@@ -74,12 +66,8 @@ def run(
         show(f"speed      {bound.describe()}")
     show(f"folder     {out}")
     show(f"curves     tensorboard --logdir {out / 'tensorboard'}")
-    with ExitStack() as held:
-        viewer = None if asked is None else held.enter_context(_viewer(stem, asked))
-        held.enter_context(voice)
+    with voice:
         progress = voice.progress
-        if viewer is not None:
-            progress.note(f"view       {viewer.url}")
         try:
             with heard_compiling(lambda begins: progress.status(COMPILING if begins else None)):
                 result = train(
@@ -90,7 +78,6 @@ def run(
                     mixed_code=options.mixed_code,
                     progress=TrainingProgress(progress, config.steps),
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
-                    view=None if viewer is None else viewer.ends,
                 )
         except FieldError as error:  # An error of the file, not of an option.
             raise UsageError(f"{options.config}: {error.line(sign=' = ')}") from None
@@ -109,14 +96,3 @@ def run(
         progress.tell(Exported(str(policy)))
         voice.finish(0, "complete", out, more=lines)
     return 0
-
-
-@contextmanager
-def _viewer(name: str, asked: ViewRequest) -> Iterator[Any]:
-    """Show a training in a viewer. Raises UsageError if the viewer cannot start."""
-    try:
-        viewer = view_part("viewer")(view_part("training page")(name, asked.port))
-    except ViewError as error:
-        raise UsageError(str(error)) from None
-    with closing(viewer):
-        yield viewer

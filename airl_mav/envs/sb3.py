@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -18,27 +18,6 @@ from airl_mav.policy.layouts import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
 """Keys of `info` in SB3's `episode` info, in addition to return, length and time."""
-
-
-class Watcher(Protocol):
-    """Passive observer of the first vehicle."""
-
-    def begun(self) -> None:
-        """Handle the start of all episodes."""
-
-    def decided(
-        self, seed: int, zone: int, action: NDArray[Any], reward: float, outcome: str | None
-    ) -> None:
-        """Handle a completed decision.
-
-        Args:
-            seed: Seed of the episode.
-            zone: Zone that bounds the goal; -1 = the whole arena.
-            action: The action.
-            reward: Reward of the decision.
-            outcome: Outcome of an episode that ended, after which the next episode has already
-                started; None otherwise.
-        """
 
 
 class Expert(saved_state.Stateful):
@@ -56,8 +35,8 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
     of SB3's Monitor, so no Monitor is needed; its time `t` is the flight time [s].
     """
 
-    def __init__(self, env: vector.NavigationVectorEnv, watcher: Watcher | None = None) -> None:
-        """Wrap a vectorized environment; `watcher` observes it.
+    def __init__(self, env: vector.NavigationVectorEnv) -> None:
+        """Wrap a vectorized environment.
 
         Raises:
             UsageError: The environment's autoreset mode does not match stable-baselines3.
@@ -68,7 +47,6 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
                 f"{AutoresetMode.SAME_STEP.value}"
             )
         self.env = env
-        self._watcher = watcher
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: NDArray[Any] = np.zeros(0)
         self._expert: Expert | None = None
@@ -90,8 +68,6 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
         self._length[:] = 0
         if self._expert is not None:
             self._expert.begin(range(self.num_envs))
-        if self._watcher is not None:
-            self._watcher.begun()
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -100,9 +76,6 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Fly one decision."""
-        # Seed and zone of the flown episode; a step may start the next one.
-        flown = self.env.navigation
-        seed, zone = int(flown.seeds[0]), int(flown.zones[0])
         seen, reward, terminated, truncated, info = self.env.step(self._actions)
         self._return += reward
         self._length += 1
@@ -119,9 +92,6 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
                 "is_success": episode["success"],
                 "episode": episode | {"t": episode["flight_time_s"]},
             }
-        if self._watcher is not None:
-            outcome = str(info["final_info"]["outcome"][0]) if done[0] else None
-            self._watcher.decided(seed, zone, self._actions[0], float(reward[0]), outcome)
         self._return[done] = 0.0
         self._length[done] = 0
         if self._expert is not None and done.any():

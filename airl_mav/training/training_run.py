@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections import deque
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -25,13 +24,12 @@ from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_succes
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
-from airl_mav.envs.sb3 import NavigationVecEnv, Watcher
+from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.stopping import bounded
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import SHIPPED
-from airl_mav.rehearsal.live_view import ViewAddresses, view_part
 from airl_mav.rehearsal.run_folder import locked
 from airl_mav.training import algorithms, checkpoint, export, onnx_export, training_folder
 from airl_mav.training.config import (
@@ -98,13 +96,12 @@ def train(
     progress: training_folder.TrainingProgress | None = None,
     device: str = "cpu",
     command: str = "airl_mav.training.training_run.train",
-    view: ViewAddresses | None = None,
 ) -> TrainingResult:
     """Train a policy to the end and export its best weights.
 
     `resume` continues the run in `out` from its newest checkpoint, if any; `mixed_code` also if
-    another version of the code began it. The live view does not
-    change the weights. Returns the run's folder, the best evaluation and the policy's card.
+    another version of the code began it. Returns the run's folder, the best evaluation and the
+    policy's card.
 
     Raises:
         UsageError: Unusable profile or algorithm, `out` is in use or contains another run, or the
@@ -120,11 +117,7 @@ def train(
         folder = training_folder.TrainingFolder.begin(
             out, config, command, resume=resume, mixed=mixed_code, say=progress.waiting
         )
-        if view is None:
-            best = fit(config, folder, progress, device)
-        else:
-            with closing(view_part("training")(view, config.environment, progress)) as watched:
-                best = fit(config, folder, watched, device, watched)
+        best = fit(config, folder, progress, device)
         return TrainingResult(folder, best, export_best(folder, config, name))
 
 
@@ -140,14 +133,14 @@ def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> N
             export.export_sb3(model, facts_of(config, name, "", 0), scratch)
 
 
-def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> NavigationVecEnv:
+def environment_of(config: TrainingConfig) -> NavigationVecEnv:
     """Create a training's environment. Raises UsageError, or FieldError with the file's fields."""
     try:
         made = NavigationVectorEnv(config.vehicles, config.environment)
     except FieldError as error:
         field = f"environment.{error.field}"
         raise FieldError(field, error.value, error.accepted, error.problem) from None
-    return NavigationVecEnv(made, watcher)
+    return NavigationVecEnv(made)
 
 
 def learner_of(config: TrainingConfig, env: NavigationVecEnv, device: str) -> BaseAlgorithm:
@@ -160,7 +153,6 @@ def fit(
     folder: training_folder.TrainingFolder,
     progress: training_folder.TrainingProgress,
     device: str,
-    watcher: Watcher | None = None,
 ) -> training_folder.Evaluation:
     """Train in a locked folder from the newest checkpoint; return the best weights' evaluation.
 
@@ -168,7 +160,7 @@ def fit(
     or initial weights are missing.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
-    env = environment_of(config, watcher)
+    env = environment_of(config)
     env.seed(config.seed)
     model = learner_of(config, env, device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))

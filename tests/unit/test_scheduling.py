@@ -75,7 +75,7 @@ def test_a_view_gives_way() -> None:
     from airl_mav.addons.view.view_messages import ViewSettings
     from airl_mav.addons.view.viewer import Viewer
 
-    request = ViewSettings(run="t", port=None, paced=False, speed=None, steerable=False,
+    request = ViewSettings(run="t", port=None, paced=False, speed=None,
                       compensable=False, compensated=False)  # fmt: skip
     viewer = Viewer(request)
     try:

@@ -1,8 +1,8 @@
-"""View of flights in a browser: live, of a training, or a replay of a run.
+"""View of flights in a browser: live, or a replay of a run.
 
 A view is a process of its own with a page of viser. Flights send it messages, which a slow view
 drops, and read its viewers' requests: pace, latency, compensation.
-Commands: `airl view RUN`; option `--view` of `airl-sitl`, `airl evaluate` and `airl train`.
+Commands: `airl view RUN`; option `--view` of `airl-sitl` and `airl evaluate`.
 Depends on: the extra `view` (viser); `airl_mav.report.scene`.
 Guide: docs/how-to/view-and-export.md.
 """
@@ -16,6 +16,4 @@ VIEW = {
     "simulation": "airl_mav.addons.view.taps:SimulationTap",
     "companion": "airl_mav.addons.view.taps:CompanionTap",
     "flight": "airl_mav.addons.view.taps:FlightTap",
-    "training page": "airl_mav.addons.view.watched_training:request_of",
-    "training": "airl_mav.addons.view.watched_training:WatchedTraining",
 }

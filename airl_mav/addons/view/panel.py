@@ -38,15 +38,6 @@ def numbers_html(shown: Shown) -> str:
     """Return the current values as an HTML table."""
     vehicle, decided = shown.vehicle, shown.decided
     rows = [("phase", shown.phase or NOTHING)]
-    if (trained := shown.trained) is not None:
-        zone = "" if trained.zone is None else f", zone {trained.zone}"
-        success = None if trained.success is None else 100.0 * trained.success
-        rows += [
-            ("training", f"{trained.steps:,} decisions{zone}"),
-            ("success", _number(success, "{:.0f} % of the newest episodes")),
-            ("reward", f"{trained.reward:+.3f}, {trained.returned:+.3f} so far"),
-            ("chosen", trained.action),
-        ]
     if vehicle is not None:
         speed = math.hypot(*vehicle.velocity)
         away = _number(shown.to_goal_m, ", {:.1f} m to the goal")

@@ -168,25 +168,8 @@ class Said(ViewMessage):
     text: str
 
 
-class Trained(ViewMessage):
-    """Result of the newest decision in a training, and the training's progress."""
-
-    kind: Literal["trained"] = "trained"
-    time_us: int
-    action: str
-    reward: float
-    returned: float
-    """Sum of the episode's rewards so far."""
-    steps: int = 0
-    """Total decisions of all vehicles so far."""
-    success: float | None = None
-    """Success rate of recent episodes, 0 to 1; None before the first episode ends."""
-    zone: int | None = None
-    """Open zone of the curriculum; None without a curriculum."""
-
-
 Told = Annotated[
-    Episode | VehicleState | CameraImage | Decided | Flight | PhaseStart | Said | Trained,
+    Episode | VehicleState | CameraImage | Decided | Flight | PhaseStart | Said,
     Field(discriminator="kind"),
 ]
 _TOLD: TypeAdapter[Told] = TypeAdapter(Told)
@@ -249,8 +232,6 @@ class ViewSettings(BaseModel):
     paced: bool
     """True if viewers may set the pace."""
     speed: float | None
-    steerable: bool
-    """True if viewers may set the latency."""
     compensable: bool
     """True if the vehicle's response is known, which latency compensation requires."""
     compensated: bool
@@ -301,8 +282,6 @@ class Shown:
     decided: Decided | None = None
     decided_image: Image | None = None
     """Policy's input image of that decision."""
-    trained: Trained | None = None
-    """Result of a training's newest decision; None outside training."""
     decisions: int = 0
     """Number of decisions received in this episode."""
     ages: deque[tuple[float, float, float]] = field(default_factory=deque)
@@ -323,8 +302,6 @@ class Shown:
             self.phase = message.phase
         elif isinstance(message, Said):
             self.texts.append(message)
-        elif isinstance(message, Trained):
-            self.trained = message
         else:
             self.flight, self.phase = message, "booting"
 

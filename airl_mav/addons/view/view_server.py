@@ -169,8 +169,7 @@ class RunPage:
             controls.add_knob, compensable=request.compensable, compensated=request.compensated
         )
         head = controls.add_pace if request.paced else lambda: None
-        latency = knob if request.steerable else lambda: None
-        self._panel = Panel(server, request.run, head=head, latency=latency)
+        self._panel = Panel(server, request.run, head=head, latency=knob)
         self._watchers = Watchers(server, controls.let_go)
         self._drawn = 0
 

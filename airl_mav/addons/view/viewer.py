@@ -100,7 +100,6 @@ def request_of(
         port=port,
         paced=paced,
         speed=(scenario.speed or REAL_TIME) if paced else None,
-        steerable=True,
         compensable=scenario.vehicle.compensable,
         compensated=scenario.pilot.compensate,
     )
