@@ -50,6 +50,9 @@ UNITS = {"norm": "", "SD": "", "normalized_thrust": "", "normalized_thrust/s": "
 }
 """Units that this simulator writes otherwise."""
 
+OF_THE_FLIGHT = ("MAV_SYS_ID", "EKF2_MAG_DECL")
+"""Parameters that PX4 sets for the instance and the place."""
+
 MEASURED_ZERO = 1e-5
 """Values of the initial calibration below this are noise."""
 
@@ -65,6 +68,7 @@ def parameters(tree: Path, log: Path) -> dict[str, tuple[str, ...]]:
         for n, v in load_profile("vehicles", "quad", VehicleProfile).rotor.px4_geometry().items()
         if "_P" in n
     }
+    flown |= {name: described[name]["default"] for name in OF_THE_FLIGHT}
     names = sorted(flown.keys() & described.keys())
     return {name: _columns(described[name], flown[name]) for name in names}
 
