@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -99,9 +99,16 @@ class Telemetry(VehicleEnd):
     def __init__(self, end: VehicleEnd) -> None:
         self._end = end
         self.answers_later = end.answers_later
-        self.deliver, self.settle = end.deliver, end.settle
         self._mav = dialect.MAVLink(None)
         self._rows: dict[int, list[tuple[float, ...]]] = {number: [] for number in ESTIMATED}
+
+    def deliver(self, frame: bytes, carry_out: Callable[[], object], *, echo: bool) -> None:
+        """Deliver a frame of the companion."""
+        self._end.deliver(frame, carry_out, echo=echo)
+
+    def settle(self) -> None:
+        """Wait until the vehicle has finished all due work."""
+        self._end.settle()
 
     def take(self) -> list[bytes]:
         """Return the received frames."""
@@ -123,7 +130,7 @@ class Telemetry(VehicleEnd):
             number = int.from_bytes(frame[7:10], "little")
             if number in ESTIMATED and frame[6] == telemetry.AUTOPILOT_COMPONENT:
                 m = self._mav.decode(bytearray(frame))
-                names = ("yaw", "yawspeed")
+                names: tuple[str, ...] = ("yaw", "yawspeed")
                 if number == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
                     names = ("x", "y", "z", "vx", "vy", "vz")
                 row = (getattr(m, name) for name in names)
@@ -131,7 +138,7 @@ class Telemetry(VehicleEnd):
         return frames
 
 
-Steps = dict[str, telemetry.StepResponse]
+Steps = dict[telemetry.StepName, telemetry.StepResponse]
 
 
 def flown_steps(aircraft: Aircraft, seed: int) -> tuple[Steps, Steps]:
@@ -180,7 +187,7 @@ def flown_steps(aircraft: Aircraft, seed: int) -> tuple[Steps, Steps]:
 def _measured(
     motion: telemetry.EstimatedMotion, sent: list[tuple[telemetry.HeldSetpoint, float]]
 ) -> Steps:
-    responses = {}
+    responses: Steps = {}
     for leg, sent_s in sent:
         if leg.step is not None:
             part = motion.between(sent_s - telemetry.BEFORE_S, sent_s + leg.seconds)

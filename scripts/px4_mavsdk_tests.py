@@ -579,30 +579,20 @@ def _failing_mission(v: Vehicle, unit: str, kind: str, height: int | None, end_s
     disarmed(v, end_s)
 
 
-for title, *_case in (
+FAILURES: tuple[tuple[str, str, str, int | None, float], ...] = (
     ("Land on GPS lost during mission (baro height mode)", "SENSOR_GPS", "OFF", BARO, 300.0),
     ("Land on GPS lost during mission (GPS height mode)", "SENSOR_GPS", "OFF", GPS, DISARM_S),
     ("Continue on mag lost during mission", "SENSOR_MAG", "OFF", None, DISARM_S),
     ("Continue on baro lost during mission (baro height mode)", "SENSOR_BARO", "OFF", BARO, 180.0),
     ("Continue on baro lost during mission (GPS height mode)", "SENSOR_BARO", "OFF", GPS, 180.0),
-    (
-        "Continue on baro stuck during mission (baro height mode)",
-        "SENSOR_BARO",
-        "STUCK",
-        BARO,
-        180.0,
-    ),
-    ("Continue on baro stuck during mission (GPS height mode)", "SENSOR_BARO", "STUCK", GPS, 180.0),
-):
-    _unit, _kind, _height, _end_s = _case
-    TESTS.append(
-        Px4Test(
-            title,
-            functools.partial(
-                _failing_mission, unit=_unit, kind=_kind, height=_height, end_s=_end_s
-            ),
-        )
-    )
+    ("Continue on baro stuck during mission (baro height mode)", "SENSOR_BARO", "STUCK", 0, 180.0),
+    ("Continue on baro stuck during mission (GPS height mode)", "SENSOR_BARO", "STUCK", 1, 180.0),
+)
+"""Name, unit, failure, EKF2_HGT_REF, and maximum time to disarm [s]."""
+
+for _name, _unit, _kind, _height, _end_s in FAILURES:
+    _fly = functools.partial(_failing_mission, unit=_unit, kind=_kind, height=_height, end_s=_end_s)
+    TESTS.append(Px4Test(_name, _fly))
 
 
 @test("Failure Injection - Reject mid-air when it is disabled")

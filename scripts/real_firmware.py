@@ -297,7 +297,7 @@ def conformance(command: Command, firmware: Firmware) -> dict[str, Any]:
     with flying(command, firmware, speed) as vehicle:
         argv += ["--connect", f"udpin://127.0.0.1:{vehicle.port}", "--out", str(found)]
         run(argv, folder / "conformance.log", accepted=(0, 1))
-    return read(found)
+    return dict(read(found))
 
 
 def speed_of(command: Command) -> float:
@@ -409,7 +409,7 @@ def agreement(real: Sequence[Results], builtin: Sequence[Results]) -> Agreement:
     pairs = [(each, other[each["name"]]) for each in real if each["name"] in other]
 
     def silent(answer: Results) -> bool:
-        return answer["outcome"].startswith(SILENT)
+        return str(answer["outcome"]).startswith(SILENT)
 
     def equal(a: Results, b: Results) -> bool:
         return (a["outcome"], a["agrees"]) == (b["outcome"], b["agrees"])
@@ -458,9 +458,10 @@ def judged_steps(estimated: Results, number: int) -> Row:
     column, title = stored_release("PX4", number)
     reference = load_profile("conformance", column, Reference)
     outside = []
-    for name, figures in estimated.items():
-        step = StepResponse(**figures)
-        found = deviations(step, reference.steps[name], reference.tolerance)
+    for name, stored in reference.steps.items():
+        if name not in estimated:
+            continue
+        found = deviations(StepResponse(**estimated[name]), stored, reference.tolerance)
         outside += [f"{name} {each}" for each in found]
     text = title if ":" in title else reference.title
     return Row("steps beyond the stored column", f"{text}: {'; '.join(outside) or 'none'}")
@@ -554,9 +555,9 @@ def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) 
         rows.append(Row("walk", text, f"{same.calls} calls"))
     if found := real.get("tests"):
         flown = [tests_of(each, number) for each in (found, builtin.get("tests")) if each]
-        failed = [[name for name, passed in each.items() if not passed] for each in flown]
-        beside_it = failed[1] if len(failed) > 1 else None
-        rows.append(outcome_row("PX4's tests", failed[0], beside_it, len(flown[0])))
+        bad = [[name for name, passed in each.items() if not passed] for each in flown]
+        beside_it = bad[1] if len(bad) > 1 else None
+        rows.append(outcome_row("PX4's tests", bad[0], beside_it, len(flown[0])))
     return rows
 
 
@@ -578,7 +579,9 @@ def table(columns: Mapping[str, Sequence[Row]], beside: Mapping[str, str]) -> st
 def report(out: Path, firmwares: Sequence[Firmware], builtins: Mapping[str, Firmware]) -> str:
     """Write drift.json and drift.md, and return the latter."""
     held = {each.name: results_of(out, each) for each in (*firmwares, *builtins.values())}
-    columns, beside, data = {}, {}, {}
+    columns: dict[str, list[Row]] = {}
+    beside: dict[str, str] = {}
+    data: dict[str, dict[str, Any]] = {}
     for firmware in firmwares:
         name, other = firmware.name, builtins[firmware.name].name
         columns[name] = rows_of(out, name, held[name], other, held[other])
