@@ -92,7 +92,7 @@ def test_the_shipped_quad_has_what_the_script_prints(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     script = ROOT / "scripts" / "fit-response"
-    monkeypatch.setattr(sys, "argv", [str(script), "px4-1.16", "--vehicle", "quad"])
+    monkeypatch.setattr(sys, "argv", [str(script), "px4-1.17", "--vehicle", "quad"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(script), run_name="__main__")
     assert ended.value.code == 0
