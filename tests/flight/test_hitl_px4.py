@@ -2,8 +2,9 @@
 
     AIRL_HITL_BOARD=board.py pytest tests/flight/test_hitl_px4.py
 
-`AIRL_HITL_BOARD LINK --instance N` runs PX4's nolockstep SITL with SYS_HITL 1, makes LINK
-a symbolic link to the host's end of its serial line, and restarts PX4 after a reboot.
+`AIRL_HITL_BOARD LINK --instance N` runs PX4's nolockstep SITL with the parameters of hitl.md, and
+makes LINK a symbolic link to the host's end of its serial line. PX4 on Linux denies a reboot: on
+this command, the program ends PX4, and starts it again 3 s later, as a board does.
 """
 
 from __future__ import annotations
