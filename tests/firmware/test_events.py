@@ -18,6 +18,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
+from airl_mav.profiles.px4_release import CURRENT
 from firmware_sim.addons.ground_station_services import component_metadata
 from firmware_sim.addons.ground_station_services.component_metadata import definitions
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
@@ -55,7 +56,7 @@ READY = Readiness(Mode.HOLD, Conditions(), ArmingSettings())
 
 def metadata() -> dict[str, Any]:
     """Return what the file on board says of the autopilot's events."""
-    packed = component_metadata.files()["all_events.json.xz"]
+    packed = component_metadata.files(CURRENT)["all_events.json.xz"]
     component: dict[str, Any] = json.loads(lzma.decompress(packed))["components"]["1"]
     return component
 

@@ -290,7 +290,8 @@ def test_controls_and_sensors_agree(flown: tuple[Path, ULog]) -> None:
     at = np.isin(thrust["timestamp"], motors["timestamp"][flying])
     commands = np.stack([motors[f"control[{i}]"][flying] for i in range(4)])
     roll, pitch, yaw = (torque[f"xyz[{axis}]"][at] for axis in range(3))
-    gains = Gains.from_parameters(log.initial_parameters.__getitem__)
+    parameters = {**px4_release().flown_values({}), **log.initial_parameters}
+    gains = Gains.from_parameters(parameters.__getitem__)
     for command, x, y, z in zip(
         commands, (-1, 1, 1, -1), (1, -1, 1, -1), (1, 1, -1, -1), strict=True
     ):

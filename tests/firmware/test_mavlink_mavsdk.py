@@ -143,7 +143,7 @@ def test_health_and_identity() -> None:
         assert health.is_home_position_ok
         info = companion.plugin(Info)
         version = info.get_version()
-        assert (version.flight_sw_major, version.flight_sw_minor) == (1, 16)
+        assert (version.flight_sw_major, version.flight_sw_minor) == (1, 17)
         assert info.get_identification().legacy_uid != 0
 
 

@@ -198,7 +198,7 @@ def test_every_stream_at_rest() -> None:
     bench = Bench()
     bench.run(0.2)
     own = {"SYSTEM_TIME", "VIBRATION", "BATTERY_STATUS", "TIMESYNC", "PING"}
-    own |= {"TIME_ESTIMATE_TO_TARGET", "MAG_CAL_REPORT"}
+    own |= {"AUTOPILOT_VERSION", "TIME_ESTIMATE_TO_TARGET", "MAG_CAL_REPORT"}
     # There is no plant, no manual control input, and no radio.
     lacking = {"HIL_STATE_QUATERNION", "MANUAL_CONTROL", "RC_CHANNELS"}
     own |= lacking | addon_builders().keys()

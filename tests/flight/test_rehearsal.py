@@ -158,6 +158,8 @@ class FakeChild:
                         epoch_ns=0,
                         slipped_us=0,
                         goal=GOAL,
+                        local_goal=GOAL,
+                        poses="",
                     ),
                 )
             )
