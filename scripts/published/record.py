@@ -173,7 +173,7 @@ def out_of_date(record: Record) -> str:
     flown = f"Flown on {made.date} with version {made.version}"
     changes = read_changes(CHANGES_FILE)
     if not stands(made.behaviour, behaviour_today(), changes, record.name, runs):
-        return f"{flown}, before today's flight behaviour."
+        return f"{flown}. Flights have changed since."
     shipped = shipped_policies()
     others = [name for name, sha256 in made.policies.items() if shipped.get(name) != sha256]
     if others:

@@ -82,7 +82,7 @@ def test_an_older_behaviour_is_said_under_its_tables(
     said = pages.rendered(text, {**records, "hardware-gap": older}, "page")
     made = today.made
     flown = f"Flown on {made.date} with version {made.version}"
-    assert f"**{flown}, before today's flight behaviour.**" in said
+    assert f"**{flown}. Flights have changed since.**" in said
     # The figures are equal: only the text about them differs.
     again = pages.rendered(text, records, "page")
     assert said.split("`airl hardware-gap")[0] == again.split("`airl hardware-gap")[0]
@@ -114,7 +114,7 @@ def test_results_without_a_fingerprint_are_marked(
     made = fresh.made.model_copy(update={"behaviour": None})
     without = [each for each in records.values() if each.made.behaviour is None]
     for each in (fresh.model_copy(update={"made": made}), *without):
-        assert "before today's flight behaviour" in record.out_of_date(each)
+        assert "Flights have changed since" in record.out_of_date(each)
 
 
 # --- changes of which it is known what they touch
