@@ -47,7 +47,7 @@ from tests.support.command_line import airl
 from tests.support.lockstep_kit import SEED, demo_scenario
 
 QUAD = load_vehicle("quad")
-VEHICLE = vehicle_of(QUAD, px4_release().parameter_values(QUAD.parameters).__getitem__)
+VEHICLE = vehicle_of(QUAD, px4_release().flown_values(QUAD.parameters).__getitem__)
 LENS = Intrinsics.of(QUAD.camera)
 TICK_US, PERIOD_US = 4000, 33_333
 ARENA, ARENA_SEED, ALTITUDE_M = "static-obstacles", 7, 2.5

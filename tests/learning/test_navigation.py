@@ -38,7 +38,7 @@ from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 
 QUAD = load_vehicle("quad")
-VEHICLE = vehicle_of(QUAD, px4_release().parameter_values(QUAD.parameters).__getitem__)
+VEHICLE = vehicle_of(QUAD, px4_release().flown_values(QUAD.parameters).__getitem__)
 TRUE_STATE = {"navigation_noise": 0.0}
 TICK_US = 4000
 PERIOD_US = 33_333
