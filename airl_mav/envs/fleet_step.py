@@ -20,6 +20,7 @@ from airl_mav.control import cascade, loops
 from airl_mav.control.demand import Demand, Gains
 from airl_mav.control.memory import (
     ATTITUDE_SP,
+    FOLLOWS,
     MEMORY_SIZE,
     RATES_SP,
     SAT,
@@ -414,7 +415,7 @@ def _keep_rates(state: State, who: NDArray[np.int64]) -> None:
                 state[MEMORY + VELOCITY_SP + axis, j] = math.nan
             for k in range(4):
                 state[MEMORY + ATTITUDE_SP + k, j] = state[ATTITUDE + k, j]
-            state[MEMORY + YAW_RATE_SP, j] = 0.0
+            state[MEMORY + YAW_RATE_SP, j] = state[MEMORY + FOLLOWS, j] = 0.0
             state[MEMORY + THRUST_SP, j] = state[MEMORY + THRUST_ON, j] = state[YAW_RATE, j]
 
 

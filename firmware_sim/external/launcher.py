@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import psutil
 
@@ -18,7 +18,9 @@ from airl_mav.core import child_process, clock, files
 from airl_mav.core.frames import Goal
 from firmware_sim import interfaces
 from firmware_sim.external.parameters import RequiredAirframe
-from firmware_sim.plant.body import PlantBody
+
+if TYPE_CHECKING:  # It loads the simulator.
+    from firmware_sim.plant.body import PlantBody
 
 REBOOT, SHUT_DOWN = 1, 2
 """First parameter of PREFLIGHT_REBOOT_SHUTDOWN."""

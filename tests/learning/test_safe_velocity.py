@@ -84,10 +84,10 @@ def test_the_measured_way_is_that_of_the_autopilot_in_pybullet(measured: Braking
             rig.run(1.5)
 
 
-def test_a_stop_takes_three_times_what_the_tilt_limit_gives(
+def test_a_stop_takes_over_three_times_what_the_tilt_limit_gives(
     measured: Braking,
 ) -> None:
-    assert measured.distance_from_m(4.08) == pytest.approx(2.72, abs=0.08)
+    assert measured.distance_from_m(4.08) == pytest.approx(2.87, abs=0.08)
     assert 4.08**2 / (2.0 * 9.80665) < 0.9  # the tilt limit's
     ways, flown = np.array(measured.distance_m), np.array(measured.flown_m_s)
     assert (np.diff(ways) > 0.0).all()

@@ -219,8 +219,8 @@ def test_the_page_is_one_file_that_reaches_nothing_else(page: str) -> None:
     assert "url(" not in style
     assert "@import" not in style
     assert all(image["alt"] for image in parsed.images)
-    # All flights; six stages that vary and their timeline; two figures for each flight.
-    assert len(parsed.images) == 1 + 6 + 1 + 2 * 5
+    # All flights; six stages that vary and their timeline; one map for each flight.
+    assert len(parsed.images) == 1 + 6 + 1 + 5
     named = {image["data-picture"] for image in parsed.images[1:]}
     assert named == set(json.loads(unpacked(script_of(page, "page-data")))["pictures"])
     inside = {ref[1:] for ref in parsed.references if ref.startswith("#")}
@@ -259,7 +259,7 @@ def test_the_page_says_what_flew_and_where_t2_comes_from(page: str) -> None:
 def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
     run, _ = demo
     names = {path.name for path in run.path.glob("*.png")}
-    expected = {f"flight-{i:03d}-{kind}.png" for i in range(5) for kind in ("map", "time")}
+    expected = {f"flight-{i:03d}-map.png" for i in range(5)}
     alone = {"latency.png", "latency-timeline.png", "trajectories.png"}
     assert names == expected | alone
     for name in names:

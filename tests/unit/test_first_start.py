@@ -64,7 +64,10 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give an empty cache, and a folder with three kernels as the working directory."""
     (tmp_path / "small.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(Path(kernels.__file__).parents[2]))
+    # Child processes do not import from the working directory.
+    path = (str(tmp_path), str(Path(kernels.__file__).parents[2]))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    monkeypatch.setenv("PYTHONSAFEPATH", "1")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
