@@ -225,10 +225,14 @@ def test_what_is_sensed_within_the_hull_gets_one_line() -> None:
         speed_bound(spec_of(None, asked))
 
 
-def test_the_shipped_policy_is_bounded_by_what_it_takes_notice_of() -> None:
+def test_the_shipped_policy_is_bounded_by_what_it_takes_notice_of(tmp_path: Path) -> None:
     name = "static-obstacles-ras-pi-4"
     config = load_profile("training", name, TrainingConfig)
-    bound = speed_bound(config.environment)
+    # It was trained with the gains of PX4 1.16.
+    shipped = (profiles_dir() / "vehicles" / "quad.toml").read_text(encoding="utf-8")
+    quad = tmp_path / "quad.toml"
+    quad.write_text(f'px4_release = "1.16"\n{shipped}', encoding="utf-8")
+    bound = speed_bound(config.environment.model_copy(update={"vehicle": str(quad)}))
     assert bound is not None
     policy = load_learned(profiles_dir() / "policies" / name)
     assert policy.card.actions.max_speed_m_s == pytest.approx(bound.safe_velocity_m_s, rel=1e-4)

@@ -13,7 +13,10 @@ from pathlib import Path
 import pytest
 
 from airl_mav.cli import list_command, main
+from airl_mav.core.first_start import compile_first
 from airl_mav.profiles.loading import Kind, list_profiles, profiles_dir
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import plan_of, resolve
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT
 from tests.support.run_demo import write_demo_run
@@ -89,6 +92,8 @@ def test_bad_toml_names_file_field_and_range(refuse: Run, tmp_path: Path) -> Non
 def test_arena_that_cannot_be_made_is_refused_before_anything_starts(
     refuse: Run, tmp_path: Path
 ) -> None:
+    # A first start compiles kernels, which its output says.
+    compile_first([plan_of(resolve(Scenario()))])
     path = tmp_path / "crammed.toml"
     path.write_text(
         """description = "two hundred pillars in a cupboard"
