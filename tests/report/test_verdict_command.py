@@ -140,16 +140,16 @@ def test_the_same_folder_answers_other_questions(whole: tuple[Path, str]) -> Non
     assert "\nmeets: success >= 50 %" in text
     # Wilson's interval alone would decide this: it does not allow repeated looks.
     with patch("airl_mav.cli.verdict_command.leave"):
-        code, text = verdict(out, require="success >= 92 %", episodes=n)
+        code, text = verdict(out, require="success >= 88 %", episodes=n)
     (finding,) = said(out)["findings"]
     reached = outcomes(out / TARGET).count("success")
-    assert 100.0 * (wilson(reached, n).high or 0.0) < 92.0 < finding["estimate"]["high"]
+    assert 100.0 * (wilson(reached, n).high or 0.0) < 88.0 < finding["estimate"]["high"]
     assert (code, said(out)["status"]) == (5, "undecided")
     assert re.search(r"about [\d,]+ more flights would tell", text)
     with patch.object(show, "write_document", lambda _, folder: folder / "hardware-gap.html"):
         code, again = airl("report", str(out))
     assert code == 0
-    assert "too few flights to tell: success >= 92 %" in again
+    assert "too few flights to tell: success >= 88 %" in again
     assert (out / TARGET / "episodes.jsonl").read_bytes() == before
     code, _ = verdict(out)
     assert code == 3
