@@ -265,17 +265,16 @@ def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
 
     Body rates are unchanged.
     """
+    fleet.repeat_us[i] += REPEAT_US
     if fleet.by_rates[i]:
         for axis in range(3):
             state[WANTED + axis, j] = fleet.setpoint[i, axis]
-        fleet.repeat_us[i] += REPEAT_US
         return
     c, s = loops.heading_of(quat(state, ATTITUDE, j))
     forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
     fleet.velocity_ned[i, 0] = c * forward - s * right
     fleet.velocity_ned[i, 1] = s * forward + c * right
     fleet.velocity_ned[i, 2] = fleet.setpoint[i, 2]
-    fleet.repeat_us[i] += REPEAT_US
     for axis in range(3):
         state[WANTED + axis, j] = fleet.velocity_ned[i, axis]
 

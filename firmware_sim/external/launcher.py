@@ -153,13 +153,10 @@ class Launcher:
 
     def _keep_flight_log(self) -> None:
         path, self.flight_log = self.flight_log, None
-        if path is None or self._folders is None:
-            return
-        if (written := self._folders.newest(path.suffix)) is None:
-            return
-        # Disk full: the flight is valid without this log.
-        with suppress(OSError), files.replacing(path, 0o600) as partial:
-            shutil.copyfile(written, partial)
+        if path and self._folders and (written := self._folders.newest(path.suffix)):
+            # Disk full: the flight is valid without this log.
+            with suppress(OSError), files.replacing(path, 0o600) as partial:
+                shutil.copyfile(written, partial)
 
     def close(self) -> None:
         """Stop the firmware and remove temporary folders."""
