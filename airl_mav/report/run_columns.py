@@ -63,11 +63,11 @@ def decision_columns(run: LoadedRun) -> Columns:
         name = setpoint_column(stamps)
         setpoints = np.full((n, 4), np.nan) if name is None else stamps[name]
         part |= {f"setpoint_{i}": setpoints[:, i] for i in range(4)}
-        if index in run.trajectories and n:
-            path = run.trajectories[index].at(stamps["sent_us"])
-            part |= dict(zip(STATE, np.hstack([path.position, path.velocity]).T, strict=True))
-        else:
-            part |= dict.fromkeys(STATE, np.full(n, np.nan))
+        states, sent = np.full((n, len(STATE)), np.nan), stamps["sent_us"] != NO_STAMP
+        if index in run.trajectories and sent.any():
+            path = run.trajectories[index].at(stamps["sent_us"][sent])
+            states[sent] = np.hstack([path.position, path.velocity])
+        part |= dict(zip(STATE, states.T, strict=True))
         parts.append(part)
     return _joined(parts)
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import minari
@@ -14,6 +15,8 @@ from airl_mav.addons.data_export.export_data import ExportDataOptions, run
 from airl_mav.cli import report_command
 from airl_mav.cli.report_command import ReportOptions
 from airl_mav.core.errors import UsageError
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.run_columns import decision_columns
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +41,13 @@ def test_tables_contain_the_arrays_of_the_run(flown: Run) -> None:
     ]
     samples = sum(len(path) for path in flown.trajectories.values())
     assert len(flown.table("trajectories")["time_us"]) == samples
+
+
+def test_an_unsent_decision_has_no_state(flown: Run) -> None:
+    stamps = dict(flown.stamps[0])
+    stamps["sent_us"] = np.append(stamps["sent_us"][:-1], NO_STAMP)
+    columns = decision_columns(replace(flown._loaded, latency={0: stamps}))
+    assert np.isnan(columns["north_m"]).tolist() == [False] * (len(stamps["sent_us"]) - 1) + [True]
 
 
 def test_csv_and_parquet_equal_the_tables(flown: Run, tmp_path: Path) -> None:
