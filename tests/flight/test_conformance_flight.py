@@ -14,6 +14,7 @@ import pytest
 
 from airl_mav.addons.conformance.telemetry import STEP_NAMES
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.profiles.px4_release import CURRENT
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import Running, running, write_arena
 
@@ -66,13 +67,13 @@ def checks_of(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def patient_reference(folder: Path) -> Path:
-    """Return PX4's column with a tolerance of 0.2 s on times.
+    """Return the column of the release flown, with a tolerance of 0.2 s on times.
 
     These tests run at three times real time: a delay of 10 ms between two processes on a busy host
     is 30 ms of simulated time. tests/flight/test_step_response.py checks the latencies to 10 % in
     simulated time.
     """
-    column = (profiles_dir() / "conformance" / "px4-1.16.toml").read_text(encoding="utf-8")
+    column = (profiles_dir() / "conformance" / f"px4-{CURRENT}.toml").read_text(encoding="utf-8")
     path = folder / "px4.toml"
     assert "floor_s = 0.015" in column
     path.write_text(column.replace("floor_s = 0.015", "floor_s = 0.200"), encoding="utf-8")
@@ -101,7 +102,9 @@ def test_the_built_in_firmware_conforms_to_px4(steps: tuple[str, ...], tmp_path:
         text = command.text()
     assert status == 0, text
     assert re.search(
-        r"^CONFORMS to PX4 1\.16: \d+ passed, 0 failed, 0 not applicable; PX4 1\.16", text, re.M
+        rf"^CONFORMS to PX4 {CURRENT}: \d+ passed, 0 failed, 0 not applicable; PX4 {CURRENT}",
+        text,
+        re.M,
     )
     checks = checks_of(out)
     assert {check["outcome"] for check in checks.values()} == {"pass"}
@@ -139,9 +142,8 @@ def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
         status = command.wait()
         text = command.text()
     assert status == 1, text
-    assert re.search(r"^FAILED: \d+ passed, 1 failed, .*: step north-2; PX4 1\.16", text, re.M), (
-        text
-    )
+    failed = rf"^FAILED: \d+ passed, 1 failed, .*: step north-2; PX4 {CURRENT}"
+    assert re.search(failed, text, re.M), text
     checks = checks_of(out)
     assert checks["step north-2"]["outcome"] == "fail"
     assert "rise" in checks["step north-2"]["finding"]

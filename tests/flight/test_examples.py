@@ -170,7 +170,7 @@ def test_compare_runs(tmp_path: Path) -> None:
 def test_failed_flight_names_causes(tmp_path: Path) -> None:
     text = output_of("failed_flight.py", tmp_path)
     assert re.search(r"^flight \d+, hit static-\S+: seen ", text, re.M)
-    assert "circled" in text
+    assert re.search(r"; speed at the collision [\d.]+ m/s\.$", text, re.M)
 
 
 def test_own_computer_replays_its_file(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_a_flight_with_every_sort_of_fault_is_the_same_every_time() -> None:
     ("fault", "outcome", "note"),
     [
         ("link cut at climb", Outcome.ABORTED, "leaving offboard failed: timeout"),
-        ("uplink cut at offboard+1s", Outcome.ABORTED, "taken over: the mode is posctl"),
+        ("uplink cut at offboard", Outcome.ABORTED, "taken over: the mode is return"),
         ("motor2 off at offboard+1s", Outcome.COLLISION, ""),
     ],
 )

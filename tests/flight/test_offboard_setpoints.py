@@ -80,7 +80,7 @@ def test_every_kind_of_setpoint() -> None:
         for _ in range(30):
             rig.ap.refuse_setpoint("SET_POSITION_TARGET_LOCAL_NED invalid", rig.sim.time_us)
             rig.run(0.05)
-        assert rig.ap.flight.mode is Mode.POSITION
+        assert rig.ap.flight.mode is Mode.RETURN
         assert rig.said("Offboard setpoints refused: SET_POSITION_TARGET_LOCAL_NED invalid") > 0.0
 
 

@@ -42,7 +42,7 @@ def test_both_plants_fly_the_same_flight(arena: str, seed: int) -> None:
     ("arena", "policy", "seed", "hit"),
     [
         # A policy that knows no obstacles, among many; and one into a wire of 2 cm.
-        ("dense-obstacles", "no-obstacles", 1, "hit static-"),
+        ("dense-obstacles", "no-obstacles", 2, "hit static-"),
         ("park", "static-obstacles-fast", 12, "hit static-wire-"),
     ],
 )

@@ -69,12 +69,12 @@ def test_a_firmware_that_stood_for_a_second_flies_on(tmp_path: Path) -> None:
 
 
 def in_lockstep(fault: str, **more: float) -> FlownEpisode:
-    resolved = demo_scenario(faults=(fault,), time_limit_s=30.0, goal_radius_m=0.5, **more)
+    resolved = demo_scenario(faults=(fault,), time_limit_s=30.0, **more)
     return fly(resolved, resolved.fresh_policy(SEED), 0, SEED)
 
 
 def test_a_suspended_companion_decides_nothing() -> None:
-    episode = in_lockstep("companion stopped at offboard+200ms for 700ms")
+    episode = in_lockstep("companion stopped at offboard+200ms for 700ms", goal_radius_m=1.5)
     record, (acted,) = episode.record, episode.record.faults
     assert acted.to_us - acted.from_us == 700_000
     assert record.outcome is Outcome.SUCCESS
@@ -85,7 +85,7 @@ def test_a_suspended_companion_decides_nothing() -> None:
 
 def test_a_companion_killed_in_lockstep_leaves_the_vehicle_to_its_failsafe() -> None:
     # High enough to stand before it is on the ground.
-    episode = in_lockstep("companion killed at offboard+200ms", altitude_m=6.0)
+    episode = in_lockstep("companion killed at offboard+200ms", goal_radius_m=0.5, altitude_m=6.0)
     record = episode.record
     assert (record.outcome, record.reason) == (Outcome.ABORTED, "companion killed")
     assert abs(episode.trajectory.position[-1, 2]) < 0.2

@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.t
 @pytest.fixture(scope="module")
 def vehicle() -> Iterator[Vehicle]:
     """A vehicle that has booted."""
-    with flown() as flight:
+    with flown(release="1.16") as flight:
         vehicle = Vehicle(flight.companion, pace=flight.at)
         vehicle.until(vehicle.telemetry.health_all_ok, 40.0)
         vehicle.until(lambda: vehicle.telemetry.health().is_armable, 10.0)

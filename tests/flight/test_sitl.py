@@ -99,11 +99,7 @@ def test_folder_is_complete_and_nothing_else(done: Done) -> None:
         *("run.json", "scenario.toml", "episodes.jsonl", "latency.npz", "trajectories.npz"),
         *("report.html", "verdict.json", "firmware.log", "companion.log"),
         *("latency.png", "latency-timeline.png", "trajectories.png"),
-        *(
-            f"{flight}{end}"
-            for flight in flights
-            for end in (".tlog", ".ulg", "-map.png", "-time.png")
-        ),
+        *(f"{flight}{end}" for flight in flights for end in (".tlog", ".ulg", "-map.png")),
     }
     for name in names:
         size = (done.folder / name).stat().st_size

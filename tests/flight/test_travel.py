@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import quat_yaw
+from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.commander import FlightPhase
 from firmware_sim.autopilot.flight_modes import Mode
@@ -33,8 +34,10 @@ def go(rig: Rig, request: Reposition, limit_s: float) -> float:
 
 
 def test_going_to_places_and_back_home() -> None:
-    """The legs of a long flight on PX4: 12 m at its cruise speed, back at 2 m/s (measured 2.12)."""
-    with flight(0, parameters={"RTL_RETURN_ALT": 12.0}) as rig:
+    """The legs of a long flight on PX4 1.16: 12 m at its cruise speed, at 2 m/s (measured 2.12)."""
+    # With the slower attitude loop of PX4 1.17 the built-in reaches 2.25 m/s here.
+    vehicle = load_vehicle("quad", "1.16")
+    with flight(0, vehicle=vehicle, parameters={"RTL_RETURN_ALT": 12.0}) as rig:
         rig.take_off(8.0, settle_s=1.0)
         fast = go(rig, Reposition(PositionYaw((12.0, 6.0, -10.0), math.radians(90.0))), 9.0)
         assert 4.0 < fast < 5.2

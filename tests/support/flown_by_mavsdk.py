@@ -16,11 +16,12 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, US_PER_S
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.mavlink.px4_links import ONBOARD_HZ, LinkConfig
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
-from tests.support.flight_rig import quad
 from tests.support.mavlink_clients import BOOT_UNIX_US, Companion, RawLane
 
 SLOW = 2.0
@@ -70,8 +71,9 @@ class Flown:
 class _Thread:
     """Ticks the vehicle and its MAVLink."""
 
-    def __init__(self, lane: RawLane) -> None:
-        setup = EpisodeSetup(quad(), None, 1, Aircraft())
+    def __init__(self, lane: RawLane, release: PX4ReleaseName) -> None:
+        vehicle = load_vehicle("quad", release)
+        setup = EpisodeSetup(vehicle, None, 1, Aircraft())
         self.simulation = Simulation(setup, start_us=0, clock=SimClock(), recording=False)
         rates = {name: min(hz, MOST_HZ) for name, hz in ONBOARD_HZ.items()}
         self.server = MavlinkServer([LinkConfig("onboard", lane, rates)], boot_unix_us=BOOT_UNIX_US)
@@ -111,10 +113,12 @@ class _Thread:
 
 
 @contextmanager
-def flown(component: ComponentType = ComponentType.GROUND_STATION) -> Iterator[Flown]:
+def flown(
+    component: ComponentType = ComponentType.GROUND_STATION, release: PX4ReleaseName = CURRENT
+) -> Iterator[Flown]:
     """Yield MAVSDK and the vehicle that it is connected to."""
     lane = RawLane()
-    thread = _Thread(lane)
+    thread = _Thread(lane, release)
     mavsdk = Mavsdk(Configuration.create_with_component_type(component))
     assert mavsdk.add_any_connection("raw://") == 0
     mavsdk.subscribe_raw_bytes_to_be_sent(lane.inbox.append)

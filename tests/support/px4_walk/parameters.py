@@ -92,7 +92,7 @@ def _altitude(of: str, value: float) -> Any:
 
 ROWS = (
     # A SITL has these, give or take those that a driver brings along.
-    Row(AREA, "get_all_params", _all, check=lambda n: n[0] >= 275 and n[1] >= 602),
+    Row(AREA, "get_all_params", _all, check=lambda n: n[0] >= 274 and n[1] >= 603),
     *(_read(name, value) for name, value in (FLOATS | INTEGERS).items()),
     Row(
         AREA,
