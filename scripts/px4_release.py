@@ -34,6 +34,9 @@ BUILD = "build/px4_sitl_default"
 
 COLUMNS = ("name", "type", "default", "min", "max", "unit")
 
+UNKNOWN_MODE = {"1.18": "TEMPORARILY_REJECTED"}
+"""First answer to a mode that PX4 does not know: `airl conformance` measured it."""
+
 RENAMED = {
     "1.16": {"MAN_DEADZONE": "MPC_HOLD_DZ"},
     # As in PX4's param_translation.cpp.
@@ -184,6 +187,7 @@ def write(release: PX4ReleaseName, tree: Path, log: Path) -> None:
     renamed, unknown = RENAMED.get(release, {}), unknown_commands(tree)
     (folder / "release.toml").write_text(
         f'version = "{release}.0"\nsource = "{source(tree)}"\n'
+        f'unknown_mode = "{UNKNOWN_MODE.get(release, "ACCEPTED")}"\n'
         + _table("renamed", "Names in this release, by the name in the current one.", renamed)
         + _table(
             "failsafes", "Rules of the failsafes, see FailsafeRules.", failsafes(tree, release)

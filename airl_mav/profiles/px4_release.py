@@ -124,6 +124,8 @@ class Px4Release:
     """Tag, commit and date of PX4's source that the data are from."""
     unknown_commands: frozenset[int]
     """Commands (MAV_CMD) of other releases that this release does not support."""
+    unknown_mode: str
+    """Answer to a mode that PX4 does not know, a MAV_RESULT."""
     failsafes: FailsafeRules
     specs: tuple[ParameterSpec, ...]
     """Parameters in ascending order of the names."""
@@ -182,7 +184,8 @@ def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
     specs = (_spec(r, current_names.get(n, n)) for n, r in sorted(rows.items()) if r["type"])
     unknown = frozenset(facts["unknown_commands"].values())
     rules = FailsafeRules(**facts["failsafes"])
-    return Px4Release(name, facts["version"], facts["source"], unknown, rules, tuple(specs))
+    version, source, unknown_mode = facts["version"], facts["source"], facts["unknown_mode"]
+    return Px4Release(name, version, source, unknown, unknown_mode, rules, tuple(specs))
 
 
 def _folder(name: str) -> Path:

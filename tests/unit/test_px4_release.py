@@ -118,3 +118,5 @@ def test_commands_that_a_release_lacks_are_unsupported(
     _, messages = rig.command(512, 148)
     (version,) = [m for m in messages if m.get_type() == "AUTOPILOT_VERSION"]
     assert version.flight_sw_version == px4_release(release).flight_sw_version
+    unknown_main_mode = 99
+    assert rig.command(176, 1, unknown_main_mode)[0] == {"1.17": 0, "1.18": 1}[release]

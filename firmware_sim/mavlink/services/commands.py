@@ -172,7 +172,9 @@ def _change_mode(base: int, main: int, sub: int, context: services.Context) -> R
     if isinstance(request, OperatorText):
         context.announce(request)
         return Result.TEMPORARILY_REJECTED
-    return Result.ACCEPTED if request is None else context.port.set_mode(request)
+    if request is None:
+        return Result[context.port.parameters.release.unknown_mode]
+    return context.port.set_mode(request)
 
 
 def _set_standard_mode(command: services.VehicleCommand, context: services.Context) -> Result:
