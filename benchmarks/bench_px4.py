@@ -54,7 +54,7 @@ ARM, TAKEOFF = 400, 22
 class Flown:
     """A bridge as a flight controller."""
 
-    internals = None
+    internals = body_by = None
     flight = CommanderState()
 
     def __init__(self, bridge: Px4Bridge) -> None:

@@ -1,7 +1,7 @@
 """The view in a browser: update rates, memory and replay.
 
 Run as `python benchmarks/bench_view.py [live memory replay]`; without arguments, all of them.
-`bench_watched.py` measures the cost of a viewer for flights and training. Requires a Chromium,
+`bench_watched.py` measures the cost of a viewer for flights. Requires a Chromium,
 which draws in software unless it has a GPU, and then takes processor time from everything else on
 the machine. The first line shows the machine's load.
 
@@ -244,7 +244,6 @@ def viewed(*, paced: bool = False) -> Iterator[Viewer]:
         port=None,
         paced=paced,
         speed=None,
-        steerable=paced,
         compensable=False,
         compensated=False,
     )

@@ -1,6 +1,6 @@
-"""Cost of a viewer for flights and training: pairs of the same run, alone and watched.
+"""Cost of a viewer for flights: pairs of the same run, alone and watched.
 
-Run as `python benchmarks/bench_watched.py [lockstep sitl training]`; without arguments, all of
+Run as `python benchmarks/bench_watched.py [lockstep sitl]`; without arguments, all of
 them. Requires a Chromium, which draws in software unless it has a GPU, and then takes processor
 time from everything else on the machine. Each figure shows the machine's load.
 
@@ -10,20 +10,17 @@ sitl      Flights in real time on twenty seeds, each alone and with a page, in t
           of the vehicle's ticks, and skipped simulated time, paired by seed. The viewer is remote:
           a process receives all data of a page, and draws nothing. With `--browser` it is a
           browser of this machine, at the lowest priority.
-training  The same short training, alone and watched: weights, wall time and processor time.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
-import hashlib
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -39,7 +36,6 @@ sys.path.insert(0, str(ROOT))
 from bench_view import load, say, viewed, wait_for  # noqa: E402 (from here on it is found)
 
 from airl_mav.flight.statistics import Estimate, median_ratio  # noqa: E402
-from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.rehearsal.live_view import ViewAddresses  # noqa: E402
 from airl_mav.scenario.model import Scenario  # noqa: E402
 from airl_mav.scenario.resolve import resolve  # noqa: E402
@@ -207,60 +203,9 @@ def disturbed(out: Path, seed: int, watch: Watch | None) -> Disturbed:
     )
 
 
-TRAINING = """
-description = "a short one"
-steps = 6_000
-vehicles = 32
-[environment]
-arena = "dynamic-obstacles"
-[algorithm]
-learning_starts = 500
-[selection]
-every = 100_000
-episodes = 1
-"""
-
-
-def measure_training(folder: Path, pairs: int = 3) -> None:
-    (folder / "bench.toml").write_text(TRAINING, encoding="utf-8")
-    ratios, weights = [], set()
-    with viewed() as viewer:
-        for k in range(pairs + 1):
-            took = {}
-            for ends in (None, viewer.ends):
-                out = folder / f"train-{k}-{ends is not None}"
-                # A process each: compiled code, allocations and caches are not shared.
-                words = [sys.executable, __file__, "--train", str(folder / "bench.toml"), str(out)]
-                words += [] if ends is None else [ends.model_dump_json()]
-                done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603
-                wall, cpu = map(float, done.stdout.split()[-2:])
-                took[ends is not None] = wall, cpu
-                with zipfile.ZipFile(out / "best" / "model.zip") as saved:
-                    weights.add(hashlib.sha256(saved.read("policy.pth")).hexdigest())
-            if k:  # the first pair compiles
-                ratios.append((took[True][0] / took[False][0], took[True][1] / took[False][1]))
-    wall, cpu = np.median(np.array(ratios), axis=0)
-    say(
-        f"training, watched: {wall:.3f} times the wall time, {cpu:.3f} times the processor time;"
-        f" weights {'the same' if len(weights) == 1 else 'DIFFER'}; {load()}"
-    )
-
-
-def train(config: str, out: str, ends: str | None) -> None:
-    """Train once, and print wall and processor time."""
-    from airl_mav.training.config import TrainingConfig
-    from airl_mav.training.training_run import train as learn
-
-    view = None if ends is None else ViewAddresses.model_validate_json(ends)
-    wall, cpu = time.monotonic(), time.process_time()
-    learn(load_profile("training", config, TrainingConfig), Path(out), name="bench", view=view)
-    print(time.monotonic() - wall, time.process_time() - cpu)
-
-
 MEASURES: dict[str, Callable[[Path], None]] = {
     "lockstep": measure_lockstep,
     "sitl": measure_sitl,
-    "training": measure_training,
 }
 
 
@@ -272,11 +217,7 @@ def main() -> None:
     parser.add_argument(
         "--browser", action="store_true", help="level sitl: a browser of this machine watches"
     )
-    parser.add_argument("--train", nargs="+", help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    if asked.train:
-        train(*asked.train, *[None] * (3 - len(asked.train)))
-        return
     say(load())
     if asked.browser:
         MEASURES["sitl"] = partial(measure_sitl, watch=by_browser)

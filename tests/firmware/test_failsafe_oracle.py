@@ -29,7 +29,8 @@ def replayed(recorded: Mapping[str, Any], rules: FailsafeRules) -> list[Compared
     def answer(line: Mapping[str, Any]) -> Mapping[str, Any]:
         return {} if "reset" in line else dict(zip(Outcome._fields, next(outcomes), strict=True))
 
-    rng, table, found = np.random.default_rng(recorded["seed"]), Table(rules), []
+    found: list[Compared] = []
+    rng, table = np.random.default_rng(recorded["seed"]), Table(rules)
     while len(found) < len(recorded["outcomes"]):
         found += compare(episode(rng), answer, table)
     return found

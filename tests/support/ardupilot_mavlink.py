@@ -221,7 +221,5 @@ class Manners:
             )
 
 
-def _version(state: AutopilotState) -> Values:
-    first, _, *rest = status.autopilot_version(state)
-    del first
-    return CAPABILITIES, VERSION, *rest
+def _version(_: AutopilotState) -> Values:
+    return CAPABILITIES, VERSION, *status.autopilot_version(VERSION)[2:]

@@ -72,13 +72,12 @@ def test_a_large_turn_agrees_with_an_integration_by_scipy() -> None:
 def test_a_yaw_rate_turns_the_tilted_reference_about_the_vertical() -> None:
     """The correction has no vertical part, and the reference keeps its tilt."""
     tilt, yaw_rate = Rotation.from_rotvec([0.0, 0.3, 0.0]), 0.5
-    x, y, z, w = tilt.as_quat()
-    ref, rate = (w, x, y, z), ZERO
 
     def setpoint(tick: int) -> tuple[float, float, float, float]:
         x, y, z, w = (Rotation.from_rotvec([0, 0, yaw_rate * tick * DT]) * tilt).as_quat()
         return w, x, y, z
 
+    ref, rate = setpoint(0), ZERO
     for tick in range(1, 101):
         ref, rate = reference_model(ref, rate, setpoint(tick), yaw_rate, W_N, DT)
     # The model adds the turn of the next period.
