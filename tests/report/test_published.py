@@ -78,7 +78,7 @@ def test_an_older_behaviour_is_said_under_its_tables(
     today, records = fresh, {**records, "hardware-gap": fresh}
     older = today.model_copy(update={"made": today.made.model_copy(update={"behaviour": "0" * 16})})
     text = "<!-- results: mitigation-gaps -->\n<!-- end of results -->"
-    assert "before today" not in pages.rendered(text, records, "page")
+    assert "Flights have changed" not in pages.rendered(text, records, "page")
     said = pages.rendered(text, {**records, "hardware-gap": older}, "page")
     made = today.made
     flown = f"Flown on {made.date} with version {made.version}"
@@ -308,7 +308,7 @@ def test_what_must_be_flown_again_is_known(tmp_path: Path, fresh: Record) -> Non
     assert "another command" in flying.why_out_of_date(other, tmp_path)
     older: Made = fresh.made.model_copy(update={"behaviour": None})
     record.write_record(fresh.model_copy(update={"made": older}), tmp_path)
-    assert "before today" in flying.why_out_of_date(declared, tmp_path)
+    assert "Flights have changed" in flying.why_out_of_date(declared, tmp_path)
 
 
 def test_commands_of_other_programs_are_refused() -> None:
