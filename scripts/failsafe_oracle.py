@@ -195,7 +195,7 @@ def compare(lines: Iterable[dict[str, Any]], answer: Answer, table: Table) -> It
 
 
 def kind(line: Mapping[str, Any], px4: Outcome, here: Outcome) -> str:
-    """Return the differing fields with both values, and what failed."""
+    """Return the differing fields with both values, and the failed flags."""
     fields = [
         f"{name} {theirs} here {ours}"
         for name, theirs, ours in zip(Outcome._fields, px4, here, strict=True)
@@ -255,7 +255,7 @@ def main() -> int:
                 if asked.record is not None:
                     recorded.append(px4)
                 elif px4 != here:
-                    # What follows has another state.
+                    # Later steps start from another state.
                     found[kind(line, px4, here)] += 1
                     break
     finally:

@@ -142,7 +142,7 @@ Steps = dict[telemetry.StepName, telemetry.StepResponse]
 
 
 def flown_steps(aircraft: Aircraft, seed: int) -> tuple[Steps, Steps]:
-    """Return the responses of one flight, by step: the true ones, and those of telemetry."""
+    """Return the responses of one flight, by step: from the true state, and from telemetry."""
     vehicle = load_vehicle(aircraft.vehicle, aircraft.px4_release)
     conducted = real_vehicle(aircraft, vehicle) or builtin_vehicle(SimClock())
     heard = Telemetry(conducted.end)

@@ -196,7 +196,7 @@ def item_reached(v: Vehicle, item: int, limit_s: float = 60.0) -> None:
 
 
 def finished(v: Vehicle, limit_s: float, each: Callable[[], None] = lambda: None) -> None:
-    """Wait for the end of the mission; `each` is called meanwhile."""
+    """Wait for the end of the mission; call `each` in every loop."""
 
     def done() -> bool:
         each()
@@ -206,7 +206,7 @@ def finished(v: Vehicle, limit_s: float, each: Callable[[], None] = lambda: None
 
 
 def on_track(v: Vehicle, places: Sequence[Place]) -> None:
-    """Check the distance from the leg to the current item; the way to the first is free."""
+    """Check the distance from the leg to the current item; the leg to the first is free."""
     current = v.plugin(Mission).mission_progress().current
     if not 0 < current < len(places):
         return
@@ -352,7 +352,7 @@ def _raw(v: Vehicle, sequence: int, command: int, place: Place | None, **values:
 
 @test("Fly Multicopter Mission with external set-current onto a DO_JUMP item", since=(1, 18))
 def jump(v: Vehicle) -> None:
-    """Select a DO_JUMP as the current item: the mission goes on to its landing."""
+    """Select a DO_JUMP as the current item: the mission continues to its landing."""
     ready(v)
     leg, jump_item = 50.0, 3
     items = [
@@ -564,7 +564,7 @@ BARO, GPS = 0, 1
 
 
 def _failing_mission(v: Vehicle, unit: str, kind: str, height: int | None, end_s: float) -> None:
-    """Fly the square; a sensor fails on the way to its second corner."""
+    """Fly the square; a sensor fails before its second corner."""
     if height is not None:
         set_int(v, "EKF2_HGT_REF", height)
     ready(v)

@@ -180,7 +180,7 @@ def flying(command: Command, firmware: Firmware, speed: float) -> Iterator[Vehic
                 vehicle = held.enter_context(started(command, firmware, speed, instance))
                 break
             except PartError:
-                # Another program may have taken the instance meanwhile.
+                # Another program may have taken the instance.
                 first = instance + 1
                 if not left:
                     raise
@@ -404,7 +404,7 @@ class Agreement:
 
 
 def agreement(real: Sequence[Results], builtin: Sequence[Results]) -> Agreement:
-    """Compare the answers to the calls that both firmwares were asked."""
+    """Compare the answers to the calls made to both firmwares."""
     other = {answer["name"]: answer for answer in builtin}
     pairs = [(each, other[each["name"]]) for each in real if each["name"] in other]
 

@@ -90,7 +90,7 @@ def _spec(row: Mapping[str, str], current_name: str) -> ParameterSpec:
         current_name=current_name,
         absent=float(effect["absent"] or math.nan),
     )
-    # Without a value of its own, a missing parameter is flown with another release's default.
+    # A missing parameter is flown with another release's default, unless effects.csv has a value.
     return spec if effect["absent"] else spec._replace(absent=spec.flown(default))
 
 

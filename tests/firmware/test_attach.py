@@ -104,7 +104,7 @@ def linked(**options: Any) -> Iterator[tuple[VehicleTelemetry, Vehicle]]:
 def exchange(
     told: VehicleTelemetry, vehicle: Vehicle, first_ms: int, last_ms: int, late_ms: int = 0
 ) -> None:
-    """Let the vehicle tell its state every 10 ms; each arrives `late_ms` later."""
+    """Let the vehicle send its state every 10 ms; each arrives `late_ms` later."""
     for now_us in range(first_ms * 1000, last_ms * 1000, 10_000):
         vehicle.tell(now_us)
         told.receive(now_us + late_ms * 1000)

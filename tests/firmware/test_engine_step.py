@@ -420,7 +420,7 @@ def test_time_follows_the_tick_count(rate_hz: int) -> None:
 
 
 def test_the_floor_holds_within_half_of_friction_and_tipping() -> None:
-    """By the forces that `push_record` returns, for winds and commands of all strengths."""
+    """Forces from `push_record`, for winds and commands of all strengths."""
     rng, seen = np.random.default_rng(0), set()
     vehicle = at_rest()
     for _ in range(400):

@@ -95,7 +95,7 @@ def horizontal(rig: Rig) -> float:
 
 
 def test_loss_without_a_pilot_returns() -> None:
-    """PX4 1.17: nobody flies the Position mode of COM_OBL_RC_ACT 0, so NAV_RCL_ACT acts."""
+    """PX4 1.17: without a pilot, NAV_RCL_ACT replaces the Position mode of COM_OBL_RC_ACT 0."""
     with flight(SEED, parameters={"COM_OBL_RC_ACT": 0, "RTL_RETURN_ALT": 5.0}) as rig:
         assert LOSS_S[0] <= lose_offboard(rig) <= LOSS_S[1]
         assert rig.mode is Mode.RETURN

@@ -427,7 +427,7 @@ def _unflyable(k: Known) -> FailsafeAction:
             action, mode = then, into
     piloted = (Mode.POSITION, Mode.ALTITUDE, Mode.STABILIZED)
     if action is not FailsafeAction.NONE and mode in piloted and k.c.manual_control_signal_lost:
-        # Nobody flies the fallback: as if the pilot were lost.
+        # The fallback has no pilot: as if the pilot were lost.
         action = _pick(_LINK, k.p.nav_rcl_act, FailsafeAction.NONE)
     return action if _flies(mode, k.c) else FailsafeAction.RTL
 

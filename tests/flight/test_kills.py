@@ -376,7 +376,7 @@ def test_killed_at_any_moment_results_are_the_same(
     kills = runs = 0
     while kills < KILLS:
         killed = Command(zygote, tmp_path, victim, f"killed-{runs}")
-        # A few kills in each run at most: a finished run starts anew.
+        # A few kills in each run at most: a finished run starts again.
         for _ in range(5):
             if kills == KILLS or not killed.kill_after(chance.uniform(0.0, duration_s)):
                 break

@@ -486,7 +486,7 @@ def test_a_jump_on_the_ground_is_found_before_the_take_off() -> None:
 
 
 def test_every_flight_has_a_time_limit() -> None:
-    """By default 120 s, and ten times the time straight to the goal at the maximum speed."""
+    """The default is 120 s, and ten times the direct flight to the goal at the maximum speed."""
     asked = with_time_limit(LimitSettings(), (30.0, 40.0), PilotSettings(max_speed_m_s=5.0))
     assert asked.flight_s == 220.0
     assert with_time_limit(LimitSettings(), GOAL, PILOT, 3610.0).flight_s == 3610.0
