@@ -108,16 +108,21 @@ def ready(v: Vehicle) -> None:
     v.until(lambda: v.telemetry.health().is_armable, 45.0)
 
 
-def arm(v: Vehicle) -> None:
-    """Arm; a denial is repeated for 30 s."""
+def accepted(v: Vehicle, request: Callable[[], object], limit_s: float) -> None:
+    """Repeat a denied request until it is accepted."""
 
-    def armed() -> bool:
+    def made() -> bool:
         with suppress(MavsdkError):
-            v.plugin(Action).arm()
+            request()
             return True
         return False
 
-    v.until(armed, 30.0)
+    v.until(made, limit_s)
+
+
+def arm(v: Vehicle) -> None:
+    """Arm; a denial is repeated for 30 s."""
+    accepted(v, lambda: v.plugin(Action).arm(), 30.0)
 
 
 def hovering(v: Vehicle) -> None:
@@ -180,14 +185,7 @@ def upload(
 
 def start_mission(v: Vehicle) -> None:
     """Start the mission; a denial is repeated for 3 s."""
-
-    def started() -> bool:
-        with suppress(MavsdkError):
-            v.plugin(Mission).start_mission()
-            return True
-        return False
-
-    v.until(started, 3.0)
+    accepted(v, lambda: v.plugin(Mission).start_mission(), 3.0)
 
 
 def item_reached(v: Vehicle, item: int, limit_s: float = 60.0) -> None:
