@@ -159,7 +159,7 @@ def source(tree: Path) -> str:
 
     def git(*arguments: str) -> str:
         return subprocess.run(
-            ["git", "-C", str(tree), *arguments],  # noqa: S607
+            ["git", "-C", str(tree), *arguments],  # noqa: S607 (git from PATH)
             check=True,
             capture_output=True,
             text=True,
