@@ -51,7 +51,7 @@ class Observer:
         """Called for a text of the autopilot."""
 
     def poses(self, source: str) -> None:
-        """Called with the source of the poses of a vehicle elsewhere, at each flight."""
+        """Called with the source of the poses of a vehicle elsewhere, when it changes."""
 
     def finished(self, record: EpisodeRecord) -> None:
         """Called when an episode has been saved."""

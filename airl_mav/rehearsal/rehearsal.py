@@ -57,6 +57,8 @@ class Rehearsal:
         self._observer = observer
         self._keeps = keeps
         self._pair: process_pair.ProcessPair | None = None
+        self._poses = ""
+        """Source of the poses of a vehicle elsewhere."""
 
     def __enter__(self) -> Rehearsal:
         """Return the rehearsal."""
@@ -150,7 +152,8 @@ class Rehearsal:
             load_timeout_s(scenario.scenario),
         )
         attached = behind_us(scenario.scenario) > 0
-        if attached and folder.note_poses(loaded.poses):
+        if loaded.poses != self._poses:
+            self._poses = loaded.poses
             self._observer.poses(loaded.poses)
         referee = Referee(scenario.task(loaded.goal))
         supervisor = EpisodeSupervisor(referee, loaded.time_us, lands=attached)

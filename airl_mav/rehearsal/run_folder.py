@@ -170,15 +170,6 @@ class RunFolder:
         info = replace(load_info(self.path), config=dict(config), seeds=tuple(seeds))
         _write_info(self.path / RUN_FILE, info)
 
-    def note_poses(self, source: str) -> bool:
-        """Add the source of the poses of a vehicle elsewhere to `run.json`; False if known."""
-        info = load_info(self.path)
-        if info.setup.firmware.endswith(source):
-            return False
-        setup = replace(info.setup, firmware=f"{info.setup.firmware}; {source}")
-        _write_info(self.path / RUN_FILE, replace(info, setup=setup))
-        return True
-
     def tlog_path(self, index: int) -> Path:
         """Return the path of an episode's raw MAVLink log; the vehicle's log is beside it."""
         return self.path / f"flight-{index:03d}.tlog"
@@ -220,7 +211,7 @@ class RunFolder:
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
         """Save episodes: the arrays, then the lines with their CRC, which commit them.
 
-        `run.json` gets the version of real firmware, which is unknown before the first flight.
+        `run.json` gets the title of real firmware, which is unknown before the first flight.
         """
         info, firmware = self.path / RUN_FILE, episodes[-1].record.firmware
         if firmware and (held := load_info(self.path)).setup.firmware != firmware:

@@ -204,6 +204,8 @@ class ExternalFlightStack:
         observer.acts_as_ground_station = not parameters.values.get(GROUND_LOSS, 0)
         if observer.version is not None:
             self.version = stored_release(airframe.firmware, observer.version)[1]
+        if source := self.title():
+            self.version += f"; {source}"
         if lacking := sorted(parameters.absent.difference(airframe.also_read)):
             raise interfaces.FirmwareMissingError(
                 f"{self.version} lacks {_some(lacking)}: accepted: a vehicle profile without it"
