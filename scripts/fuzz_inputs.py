@@ -38,8 +38,8 @@ from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import LOOPBACK, TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.signing import read_key
+from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Kinematics, encode
-from airl_mav.policy.registry import GreedyPolicy
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.rehearsal.firmware_process import aircraft_of, episode_of
 from airl_mav.scenario.resolve import resolve

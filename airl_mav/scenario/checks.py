@@ -204,6 +204,9 @@ def decide_piloting(
     """
     card = policy.card
     known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
+    built_in = None if policy.program else registry.POLICIES.get(policy.name)
+    if built_in is not None and built_in.hold_s is not None:
+        known["hold_s"] = built_in.hold_s
     if not actions.KINDS[policy.commands].steady:
         # Decide on every image: nothing else keeps the vehicle level.
         known["decisions"] = "pipelined"

@@ -381,7 +381,7 @@ def test_hung_policy_is_stopped_then_leaves_offboard_then_lands(
 HOG = """
 import ctypes
 from airl_mav.policy.actions import Action
-from airl_mav.policy.registry import POLICIES
+from airl_mav.policy.registry import POLICIES, BuiltInPolicy
 
 class Hog:
     def __init__(self, hold_s):
@@ -392,7 +392,7 @@ class Hog:
             ctypes.PyDLL(None).sleep(300)  # C code that does not let go of the interpreter
         return Action(0.7, 0.0, 0.0)
 
-POLICIES["hog"] = ("holds the interpreter", Hog)
+POLICIES["hog"] = BuiltInPolicy("holds the interpreter", Hog)
 from airl_mav.cli.main import companion
 companion()
 """
@@ -418,7 +418,7 @@ def test_policy_that_holds_the_interpreter_ends_the_process(tmp_path: Path, grou
 
 RAISER = """
 from airl_mav.policy.actions import Action
-from airl_mav.policy.registry import POLICIES
+from airl_mav.policy.registry import POLICIES, BuiltInPolicy
 
 class Raiser:
     def __init__(self, hold_s):
@@ -429,7 +429,7 @@ class Raiser:
             raise RuntimeError("out of ideas")
         return Action(0.7, 0.0, 0.0)
 
-POLICIES["raiser"] = ("raises", Raiser)
+POLICIES["raiser"] = BuiltInPolicy("raises", Raiser)
 from airl_mav.cli.main import companion
 companion()
 """

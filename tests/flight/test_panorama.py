@@ -24,7 +24,7 @@ from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import MOST_FRAMES, ObservationSpec
-from airl_mav.policy.registry import GreedyPolicy
+from airl_mav.policy.greedy import GreedyPolicy
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.poses import at_rest

@@ -19,16 +19,9 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import Action
+from airl_mav.policy.greedy import GreedyPolicy, GreedySettings, clearance, near_points
 from airl_mav.policy.observation import Kinematics, Observation, encode
-from airl_mav.policy.registry import (
-    POLICIES,
-    GreedyPolicy,
-    GreedySettings,
-    clearance,
-    find_policy,
-    load_policy,
-    near_points,
-)
+from airl_mav.policy.registry import POLICIES, find_policy, load_policy
 
 LENS = Intrinsics.from_fov(64, 48, math.radians(90.0))
 HALF_FOV = math.radians(45.0)
@@ -85,7 +78,8 @@ def look(
 
 def blank(goal: tuple[float, float], depth_m: float = 0.0) -> Observation:
     depth = np.full((48, 64), depth_m * 1000.0, np.uint16)
-    return Observation(depth, LENS, np.array(goal), np.zeros(3), 0.0, 0.0, 0.0)
+    state = Kinematics(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    return Observation(depth, LENS, np.array(goal), np.zeros(3), 0.0, 0.0, 0.0, states=(state,))
 
 
 ANGLE = st.floats(-math.pi, math.pi)

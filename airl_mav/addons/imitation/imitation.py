@@ -46,7 +46,7 @@ from airl_mav.policy.actions import (
     fastest_climb,
 )
 from airl_mav.policy.layouts import Encoded
-from airl_mav.policy.registry import GreedyPolicy, GreedySettings
+from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.training import config, dqn
 
 

@@ -1,0 +1,314 @@
+"""The planner: map, path, tracks and flights."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from airl_mav import Scenario, rehearse
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.judge import Outcome
+from airl_mav.policy.actions import Action
+from airl_mav.policy.planner import (
+    BLOCKED,
+    CELLS,
+    MOVES,
+    OccupancyMap,
+    PlannerPolicy,
+    PlannerSettings,
+    Track,
+    follow,
+    scan,
+)
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile, profiles_dir
+from tests.unit.test_greedy import arena, look
+
+S = PlannerSettings()
+FOV = math.radians(90.0)
+BEARINGS = 45
+NO_HITS = np.empty((0, 2))
+TEST_ARENAS = sorted((profiles_dir() / "arenas" / "test").glob("*.toml"))
+
+Floats = NDArray[np.float64]
+
+
+def new_map(goal: tuple[float, float] = (30.0, 0.0)) -> OccupancyMap:
+    return OccupancyMap(np.zeros(2), np.array(goal))
+
+
+def seen_from(position: Floats, circles: list[tuple[Floats, float]]) -> tuple[Floats, Floats]:
+    """Ranges (b,) and points (b, 2) of circles seen from a position along the north axis."""
+    angle = (np.arange(BEARINGS) + 0.5) * (FOV / BEARINGS) - 0.5 * FOV
+    ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ranges = np.full(BEARINGS, np.inf)
+    for center, radius in circles:
+        to = center - position
+        along, square = ray @ to, float(to @ to)
+        inside = radius**2 - (square - along**2)
+        hit = along - np.sqrt(np.maximum(inside, 0.0))
+        ranges = np.where((inside > 0.0) & (along > 0.0), np.minimum(ranges, hit), ranges)
+    points, seen = np.full((BEARINGS, 2), np.inf), np.isfinite(ranges)
+    points[seen] = position + ranges[seen, None] * ray[seen]
+    return ranges, points
+
+
+# --- map
+
+
+def test_a_map_shows_a_wall_and_the_free_space_in_front_of_it() -> None:
+    known, policy = new_map(), PlannerPolicy()
+    wall = look(arena((8.5, 0.0, 0.5, 6.0)), (30.0, 0.0))
+    for _ in range(3):
+        policy.act(wall)
+    assert policy._map is not None
+    evidence = policy._map.evidence
+    # The wall's near face is 8 m north: its cell, or the next one.
+    row, column = known.cells_of(np.array([[8.0, 0.0], [8.0, 4.0]]))
+    assert all(evidence[r - 1 : r + 2, c].max() > 0.0 for r, c in zip(row, column, strict=True))
+    free = known.cells_of(np.array([[2.0, 0.0], [5.0, 3.0], [6.5, -5.0]]))
+    assert (evidence[free] < 0.0).all()
+    behind = known.cells_of(np.array([[10.5, 0.0], [-5.0, 0.0], [3.0, 9.0]]))
+    assert (evidence[behind] == 0.0).all()
+
+
+def test_looks_through_a_cell_free_it_again() -> None:
+    known = new_map()
+    ranges, points = seen_from(np.zeros(2), [(np.array([6.0, 0.0]), 0.5)])
+    hits = points[np.isfinite(ranges)]
+    cell = known.cells_of(np.array([[5.5, 0.0]]))
+    for _ in range(20):
+        known.look(np.zeros(2), 0.0, FOV, ranges, hits)
+    most = float(known.evidence[cell][0])
+    assert most > 0.0
+    for looks in range(1, 12):
+        known.look(np.zeros(2), 0.0, FOV, np.full(BEARINGS, np.inf), NO_HITS)
+        assert known.evidence[cell][0] == pytest.approx(max(-2.0, most - looks))
+
+
+@given(st.integers(0, 2**31), st.floats(0.0, 0.2))
+def test_gaps_agree_with_scipy(seed: int, share: float) -> None:
+    known = new_map()
+    known.evidence = np.where(np.random.default_rng(seed).random((CELLS, CELLS)) < share, 1.0, -1.0)
+    gap = known.gaps(NO_HITS, S.comfort_m)
+    free = known.evidence <= 0.0
+    if free.all():
+        assert (gap > S.comfort_m).all()
+        return
+    expected = ndimage.distance_transform_edt(free, sampling=known.cell)
+    near = expected <= S.comfort_m
+    np.testing.assert_allclose(gap[near], expected[near], atol=1e-9)
+    assert (gap[~near] > S.comfort_m).all()
+
+
+@given(st.lists(st.tuples(st.integers(-30, 30), st.floats(0.1, 25)), max_size=80))
+def test_a_scan_keeps_the_nearest_range_of_each_bearing(
+    polar: list[tuple[int, float]],
+) -> None:
+    # In the middle of bearings of 2 degrees, also of some out of view.
+    angle = np.radians([2.0 * each[0] for each in polar])
+    ranges = np.array([each[1] for each in polar])
+    points = np.stack([ranges * np.cos(angle), ranges * np.sin(angle)], axis=1).reshape(-1, 2)
+    found = scan(points, FOV, BEARINGS)
+    for k in range(BEARINGS):
+        inside = [each for number, each in polar if number == k - BEARINGS // 2]
+        assert found[k] == pytest.approx(min(inside, default=math.inf))
+
+
+# --- path
+
+
+def reference_cost(known: OccupancyMap, start: Floats, goal: Floats, gap: Floats) -> Floats:
+    """Costs of all nodes to the goal, by Dijkstra's algorithm with a heap."""
+    half = CELLS // 2
+    wide = gap.reshape(half, 2, half, 2).max(axis=(1, 3))
+    room = (wide - S.radius_m) / (S.comfort_m - S.radius_m)
+    cost = np.where(room < 0.15, BLOCKED, 1.0 / np.clip(room, 0.25, 1.0))
+    rows, columns = known.cells_of(np.stack([start, goal]))
+    best = np.full((half, half), np.inf)
+    end = (int(rows[1]) // 2, int(columns[1]) // 2)
+    best[end] = 0.0
+    heap = [(0.0, end)]
+    moves = [(s * r, s * c) for r, c in MOVES for s in (1, -1)]
+    while heap:
+        so_far, (r, c) = heapq.heappop(heap)
+        if so_far > best[r, c]:
+            continue
+        for dr, dc in moves:
+            to = (r + dr, c + dc)
+            if not (0 <= to[0] < half and 0 <= to[1] < half):
+                continue
+            on_way = [(r, c), to]
+            if abs(dr) == 2:
+                on_way += [(r + dr // 2, c), (r + dr // 2, c + dc)]
+            elif abs(dc) == 2:
+                on_way += [(r, c + dc // 2), (r + dr, c + dc // 2)]
+            length = math.hypot(dr, dc) * 2.0 * known.cell
+            there = so_far + length * float(np.mean([cost[each] for each in on_way]))
+            if there < best[to] - 1e-12:
+                best[to] = there
+                heapq.heappush(heap, (there, to))
+    return best
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_path_has_the_least_cost(seed: int) -> None:
+    known, start, goal = new_map(), np.zeros(2), np.array([30.0, 4.0])
+    rng = np.random.default_rng(seed)
+    for _ in range(25):
+        row, column = rng.integers(10, CELLS - 20, 2)
+        known.evidence[row : row + rng.integers(1, 9), column : column + rng.integers(1, 9)] = 5.0
+    gap = known.gaps(NO_HITS, S.comfort_m)
+    path = known.path(start, goal, gap, S)
+    best = reference_cost(known, start, goal, gap)
+    nodes = [tuple((index // 2).astype(int)) for index in (path - known.origin) / known.cell]
+    costs = [best[node] for node in nodes]
+    # Each node of a path of least cost is nearer to the goal, by the cost of its link.
+    assert all(a > b for a, b in pairwise(costs))
+    np.testing.assert_allclose(path[-1], goal)
+    again = known.path(start, goal, gap, S)
+    np.testing.assert_array_equal(path, again)
+    assert best[nodes[0]] < BLOCKED * known.cell
+    assert (gap[known.cells_of(path[1:-1])] > 0.0).all()
+
+
+def test_no_path_leads_through_a_wall_one_cell_thick() -> None:
+    known, start, goal = new_map(), np.zeros(2), np.array([20.0, 0.0])
+    (row, _), (_, column) = known.cells_of(np.array([[10.0, 0.0], [10.0, 12.0]]))
+    known.evidence[row, :] = 5.0
+    # A door of 2 m.
+    door = slice(column - 3, column + 2)
+    known.evidence[row, door] = -2.0
+    gap = known.gaps(NO_HITS, S.comfort_m)
+    path = known.path(start, goal, gap, S)
+    crossing = path[np.abs(path[:, 0] - 10.0) < 0.6]
+    assert len(crossing) > 0
+    assert (np.abs(crossing[:, 1] - 12.0) < 1.2).all()
+
+
+def test_without_scipy_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "scipy.sparse", None)
+    known = new_map()
+    gap = known.gaps(NO_HITS, S.comfort_m)
+    with pytest.raises(UsageError, match="needs scipy"):
+        known.path(np.zeros(2), np.array([20.0, 0.0]), gap, S)
+
+
+# --- tracks
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 1.5), (-2.0, 0.5), (-1.0, -2.0), (0.0, 3.5)])
+def test_a_moving_obstacle_is_tracked(velocity: tuple[float, float]) -> None:
+    known, tracks, going = new_map(), list[Track](), np.array(velocity)
+    for step in range(14):
+        at = np.array([9.0, 0.0]) + (0.1 * step - 0.7) * going
+        ranges, points = seen_from(np.zeros(2), [(at, 0.6)])
+        tracks, moving = follow(tracks, known, points, ranges, 0.1)
+        known.look(np.zeros(2), 0.0, FOV, ranges, points[np.isfinite(ranges) & ~moving])
+    (track,) = [each for each in tracks if each.moving]
+    assert moving[np.isfinite(ranges)].all()
+    assert np.hypot(*(track.velocity - going)) < 0.35 * np.hypot(*going)
+    # The visible surface is nearer than the middle.
+    assert np.hypot(*(track.position - at)) < 0.9
+
+
+@pytest.mark.parametrize("speed", [1.0, 3.0, 5.0])
+def test_static_obstacles_seen_in_flight_do_not_move(speed: float) -> None:
+    rng = np.random.default_rng(3)
+    circles = [
+        (np.array([rng.uniform(8.0, 30.0), rng.uniform(-12.0, 12.0)]), rng.uniform(0.2, 1.5))
+        for _ in range(14)
+    ]
+    known, tracks, said = new_map(), list[Track](), 0
+    for step in range(int(20.0 / speed / 0.1)):
+        position = np.array([0.1 * step * speed, -13.0])
+        ranges, points = seen_from(position, circles)
+        ranges = ranges + np.where(np.isfinite(ranges), rng.normal(0.0, 0.02, BEARINGS), 0.0)
+        tracks, moving = follow(tracks, known, points, ranges, 0.1)
+        known.look(position, 0.0, FOV, ranges, points[np.isfinite(ranges) & ~moving])
+        said += int(moving.sum())
+    assert said <= 0.01 * BEARINGS * step
+
+
+def test_a_lost_obstacle_is_forgotten() -> None:
+    known, nothing = new_map(), np.full(BEARINGS, np.inf)
+    track = Track(np.array([5.0, 0.0]), np.array([3.0, 0.0]), 0.5, np.array([2.0, 0.0]), 1.0)
+    tracks = [track]
+    for _ in range(20):
+        tracks, _ = follow(tracks, known, np.full((BEARINGS, 2), np.inf), nothing, 0.1)
+    assert tracks == []
+    np.testing.assert_allclose(track.position, [8.0, 0.0], atol=0.2)
+
+
+# --- decisions
+
+
+def test_it_flies_straight_to_a_visible_goal() -> None:
+    action = PlannerPolicy().act(look(arena(), (15.0, 0.0)))
+    assert isinstance(action, Action)
+    assert action.forward_m_s == pytest.approx(S.max_speed_m_s, rel=0.02)
+    assert abs(action.right_m_s) < 0.1
+    assert action.yaw_rate_rad_s == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_it_passes_a_wall_on_the_shorter_side(side: float) -> None:
+    policy = PlannerPolicy()
+    wall = look(arena((10.0, side * 3.0, 0.3, 5.0)), (20.0, 0.0))
+    action = [policy.act(wall) for _ in range(3)][-1]
+    assert action.right_m_s * side < -0.5
+    assert action.yaw_rate_rad_s * side < 0.0
+
+
+def test_it_stays_within_its_speed_and_turns_to_a_goal_behind() -> None:
+    policy = PlannerPolicy()
+    action = policy.act(look(arena(), (-12.0, 2.0)))
+    assert math.hypot(action.forward_m_s, action.right_m_s) <= 0.25 * S.max_speed_m_s + 1e-9
+    assert action.yaw_rate_rad_s == pytest.approx(S.max_yaw_rate_rad_s)
+
+
+# --- flights
+
+
+def flown(arena_name: str, seed: int, episodes: int, out: Path) -> list[Any]:
+    scenario = Scenario(
+        policy="planner", arena=arena_name, level="gym", seed=seed, episodes=episodes
+    )
+    assert scenario.hold_s is None
+    return list(rehearse(scenario, out=out).episodes)
+
+
+@pytest.mark.parametrize("name", ["rooms", "dense-obstacles", "test/l-walls", "test/poles-160"])
+def test_it_reaches_goals_behind_walls(name: str, tmp_path: Path) -> None:
+    file = str(profiles_dir() / "arenas" / f"{name}.toml") if "/" in name else name
+    episodes = flown(file, 700_101, 4, tmp_path / "run")
+    assert [each.outcome for each in episodes] == [Outcome.SUCCESS] * 4
+
+
+def test_the_same_seed_gives_the_same_flight(tmp_path: Path) -> None:
+    first, second = (flown("crowded", 700_200, 2, tmp_path / name) for name in "ab")
+    assert [each.quality for each in first] == [each.quality for each in second]
+
+
+def test_six_test_arenas_are_fixed() -> None:
+    assert [path.stem for path in TEST_ARENAS] == [
+        "corridor",
+        "l-walls",
+        "movers-fast",
+        "movers",
+        "poles-160",
+        "poles-80",
+    ]
+    for path in TEST_ARENAS:
+        assert load_profile("arenas", str(path), ArenaSpec).description.startswith("Test arena")
