@@ -17,6 +17,7 @@ from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
+from airl_mav.policy.card import weak_arenas
 from airl_mav.profiles.projections import SLOW
 from airl_mav.rehearsal import host_pace
 from airl_mav.scenario.model import Scenario
@@ -72,6 +73,8 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
     with voice, film:
         if warning:
             voice.progress.note(f"{warning}; --level lockstep needs no real time", "yellow")
+        if caution := weakness(scenario):
+            voice.progress.note(caution, "yellow")
         flown = fly_live(
             scenario,
             options.out,
@@ -81,6 +84,14 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         )
         judged = conclude(flown, options, requirements, voice)
     return EXIT_CODES[flown.ended] or judged
+
+
+def weakness(scenario: ResolvedScenario) -> str:
+    """Return a warning if the policy's card has a low success rate in this arena; empty if not."""
+    policy, arena = scenario.policy, scenario.arena_name
+    rate = weak_arenas(() if policy.card is None else policy.card.results).get(arena)
+    told = f"warning: {policy.name} reaches {rate or 0.0:.0%} of the goals in {arena}, by its card"
+    return "" if rate is None else f"{told}; airl evaluate planner compares"
 
 
 def video_of(

@@ -15,7 +15,7 @@ import hashlib
 import io
 import json
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -110,6 +110,16 @@ class MeasuredResult(ProfileModel):
             energy_j=quality.energy_j.value,
             **conditions,
         )
+
+
+WEAK = 0.9
+"""Success rate below which a policy should not fly in an arena."""
+
+
+def weak_arenas(results: Sequence[MeasuredResult]) -> dict[str, float]:
+    """Return the success rates below `WEAK`, by arena, without an injected latency."""
+    plain = {each.arena: each.success_rate for each in results if each.latency is None}
+    return {arena: rate for arena, rate in plain.items() if rate < WEAK}
 
 
 class PolicyFacts(ProfileModel):

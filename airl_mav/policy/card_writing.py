@@ -34,6 +34,7 @@ from airl_mav.policy.card import (
     read_card,
     read_model,
     read_torch_program,
+    weak_arenas,
 )
 from airl_mav.policy.layouts import GOAL, VELOCITY
 from airl_mav.policy.observation_spec import ObservationSpec
@@ -134,6 +135,9 @@ def _page(card: PolicyCard) -> Iterator[str]:
         values = [(getattr(result, field), shown) for field, _, shown in QUALITIES]
         cells = ["-" if value is None else shown.format(value) for value, shown in values]
         yield f"| {_model_conditions(result)} | {result.episodes} | {' | '.join(cells)} |"
+    if weak := weak_arenas(card.results):
+        listed = ", ".join(f"{arena} ({rate:.1%})" for arena, rate in weak.items())
+        yield from ("", f"Do not fly it in: {listed}.")
 
 
 def _model_conditions(result: MeasuredResult) -> str:

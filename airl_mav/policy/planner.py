@@ -1,4 +1,4 @@
-"""Planner: a classical policy that flies by a map of what its depth camera has seen.
+"""Planner: a classical policy with a map of its depth images.
 
 A level scan of each image updates an occupancy grid (Elfes, IEEE Computer 22(6), 1989) and tracks
 of moving obstacles. Dijkstra's algorithm finds the path to the goal; unknown cells count as free.
@@ -142,7 +142,7 @@ class OccupancyMap:
         return np.asarray((1.0 - u) * near + u * far)
 
     def is_clear(self, gap: Floats, start: Floats, end: Floats, room_m: float) -> bool:
-        """Return whether the gap along a line is `room_m`, or that of its start."""
+        """Return True if the gap along a line is at least `room_m`, or its start's gap."""
         length = float(np.hypot(*(end - start)))
         share = np.linspace(0.0, 1.0, 2 + int(2.0 * length / self.cell))
         found = gap[self.cells_of(start + share[:, None] * (end - start))]

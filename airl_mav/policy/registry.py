@@ -239,7 +239,7 @@ POLICIES: dict[str, BuiltInPolicy] = {
         lambda hold_s: GreedyPolicy(GreedySettings(period_s=hold_s)),
     ),
     "planner": BuiltInPolicy(
-        "classical planner: a map of the depth images, the shortest path, tracks of what moves",
+        "classical planner: a map of the depth images, a path search, tracks of moving obstacles",
         lambda hold_s: PlannerPolicy(PlannerSettings(period_s=hold_s)),
         hold_s=0.1,
     ),

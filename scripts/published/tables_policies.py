@@ -90,9 +90,9 @@ def generalisation_paper(records: Records) -> str:
     return table(("trained in", "", *arenas), rows, 3)
 
 
-@block("generalisation", "generalisation")
-def generalisation(records: Records) -> str:
-    runs = records["generalisation"].runs
+@block("policies-in-arenas", "policies-in-arenas")
+def policies_in_arenas(records: Records) -> str:
+    runs = records["policies-in-arenas"].runs
     arenas = tuple(dict.fromkeys(run.arena for run in runs.values()))
     rows = []
     for policy in dict.fromkeys(run.policy for run in runs.values()):

@@ -20,11 +20,11 @@ from airl_mav.envs.observations import COMPILED
 from airl_mav.envs.spec import spec_of
 from airl_mav.lockstep.lockstep_flight import fly
 from airl_mav.policy.actions import Action
+from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.images import NUMPY
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import MOST_FRAMES, ObservationSpec
-from airl_mav.policy.greedy import GreedyPolicy
 from firmware_sim.plant.camera import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.poses import at_rest

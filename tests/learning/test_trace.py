@@ -21,8 +21,8 @@ from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stages import stage_samples
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import Action
-from airl_mav.policy.observation import Observation
 from airl_mav.policy.greedy import GreedyPolicy
+from airl_mav.policy.observation import Observation
 from tests.support.recording import TestRecorder, record_tick
 
 SEEDS = range(1, 13)

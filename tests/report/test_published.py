@@ -239,7 +239,7 @@ def test_a_table_of_runs_is_collected_and_shown(tmp_path: Path) -> None:
     )
     found = collect(declare("airl evaluate", "matrix"), tmp_path / "matrix", None)
     assert list(found.runs) == list(result.runs)
-    shown = tables_policies.generalisation({"generalisation": found})
+    shown = tables_policies.policies_in_arenas({"policies-in-arenas": found})
     assert "| `greedy` (classical) |" in shown
     for name, run in result.runs.items():
         assert found.runs[name].success_rate.value == pytest.approx(run.quality.success_rate.value)

@@ -18,10 +18,10 @@ from airl_mav.camera.primitives import OBSTACLE
 from airl_mav.camera.render import render
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
+from airl_mav.policy.greedy import near_points
 from airl_mav.policy.images import rays_of
 from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
-from airl_mav.policy.greedy import near_points
 from airl_mav.prediction import CameraPose, PosedImage, Reprojector
 from airl_mav.profiles.arena import DEFAULT_APPEARANCE
 from airl_mav.profiles.projections import UNDISTORTED, Distortion

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from airl_mav.cli.sitl_command import weakness
 from airl_mav.policy.card import MeasuredResult, read_card
 from airl_mav.policy.card_writing import (
     MODEL_CARD_FILE,
@@ -16,6 +17,8 @@ from airl_mav.policy.card_writing import (
     write_card,
 )
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
 
 yaml = pytest.importorskip("yaml", reason="needs the [docs] extra")
 
@@ -63,6 +66,23 @@ def test_a_result_that_is_added_appears_on_the_page(folder: Path) -> None:
     ]
     assert 'arena odd "arena": #1, level lockstep, seeds 5 to 24' in names
     assert "| 20 | 25.0% | - | - | - |" in page
+
+
+def test_weak_arenas_are_on_the_page_and_warned_of(folder: Path) -> None:
+    weak = MeasuredResult(arena="crowded", level="gym", episodes=200, seed=1, success_rate=0.62)
+    add_result(folder, weak)
+    late = {"arena": "rooms", "latency": "400ms", "success_rate": 0.1}
+    add_result(folder, weak.model_copy(update=late))
+    add_result(folder, weak.model_copy(update={"arena": "hall", "success_rate": 0.9}))
+    page = (folder / MODEL_CARD_FILE).read_text(encoding="utf-8")
+    assert page.endswith("\nDo not fly it in: crowded (62.0%).\n")
+    asked = Scenario(policy=str(folder), arena="crowded")
+    told = weakness(resolve(asked))
+    assert "reaches 62% of the goals in crowded, by its card" in told
+    assert "\n" not in told
+    for arena in ("rooms", "hall", "park"):
+        assert weakness(resolve(asked.model_copy(update={"arena": arena}))) == ""
+    assert weakness(resolve(Scenario(policy="greedy", arena="crowded"))) == ""
 
 
 def test_a_page_of_somebody_s_own_stays(folder: Path) -> None:

@@ -45,8 +45,8 @@ from airl_mav.policy.actions import (
     discrete_actions,
     fastest_climb,
 )
-from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
+from airl_mav.policy.layouts import Encoded
 from airl_mav.training import config, dqn
 
 
