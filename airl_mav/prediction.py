@@ -290,7 +290,9 @@ class Compensator:
         self._setpoint = np.zeros((n, room, 4))
         """Setpoints, newest first: forward, right, down [m/s], yaw rate [rad/s]."""
         self._answered_us = np.zeros((n, room), np.int64)
-        """Start of the vehicle's response to each [µs]."""
+        """Start of the velocity's response to each [µs]."""
+        self._sooner_us = self._dead_us - round(self._response.yaw_rate_dead_time_s * US_PER_S)
+        """Time by which the yaw rate responds sooner [µs]."""
         self._stopped_us = np.full(n, NEVER_US, np.int64)
         """Expiry of the newest setpoint, after which the vehicle hovers [µs]."""
 
@@ -379,7 +381,8 @@ class Compensator:
 
     def _heading_rate(self, now_us: NDArray[np.int64]) -> Vector:
         """Return the turn rates (n,) [rad/s] of the vehicles, by their setpoints alone."""
-        turns, begins_us = self._setpoint[:, ::-1, 3].T, self._answered_us.T[::-1]
+        turns = self._setpoint[:, ::-1, 3].T
+        begins_us = (self._answered_us - self._sooner_us).T[::-1]
         # Each turn lasts until the response to the next setpoint begins.
         ends_us = np.minimum(np.vstack([begins_us[1:], now_us]), now_us)
         answered_s = np.maximum(ends_us - begins_us, 0) / US_PER_S
@@ -394,17 +397,19 @@ class Compensator:
     ) -> tuple[MotionBatch, Vector]:
         """Return the predicted motion, and the setpoints (n, 4) that will be in effect."""
         acts_us = now_us + self.memory.latency.expected_us() + LINK_US
-        # A stop follows the newest setpoint: zero velocity.
-        flown = [*self._setpoint.swapaxes(0, 1)[::-1], np.zeros_like(self._setpoint[:, 0])]
-        # Each lasts until the next takes effect, limited to the time from now to the effect.
-        marks_us = np.vstack([now_us, self._answered_us.T[-2::-1], self._stopped_us, acts_us])
-        marks_us = np.minimum(np.maximum.accumulate(marks_us), acts_us)
+        turned_us = self._answered_us - self._sooner_us
+        marks_us = np.vstack([now_us, self._answered_us.T, turned_us.T, self._stopped_us, acts_us])
+        marks_us = np.sort(np.clip(marks_us, now_us, acts_us), axis=0)
         seconds = np.diff(marks_us, axis=0) / US_PER_S
-        command = flown[0]
-        # Skip setpoints that no vehicle flies in this time.
+        command = self._setpoint[:, -1]
+        # Skip empty intervals.
         for k in np.flatnonzero(seconds.any(axis=1)).tolist():
-            motion = flown_on(motion, flown[k], self._response, seconds[k])
-            command = np.where(seconds[k, :, None] > 0.0, flown[k], command)
+            flown = _newest(self._setpoint, self._answered_us, marks_us[k])
+            flown[:, 3] = _newest(self._setpoint, turned_us, marks_us[k])[:, 3]
+            # A stop follows the newest setpoint: zero velocity.
+            flown[self._stopped_us <= marks_us[k]] = 0.0
+            motion = flown_on(motion, flown, self._response, seconds[k])
+            command = np.where(seconds[k, :, None] > 0.0, flown, command)
         return motion, command
 
     def _keep(
@@ -417,6 +422,14 @@ class Compensator:
         pose = self._mount.pose(position, quaternion)
         self._depth_mm[i, 0], self._position[i, 0], self._axes[i, 0] = depth_mm, *pose
         self._kept[i] = min(self._kept[i] + 1, self._depth_mm.shape[1])
+
+
+def _newest(setpoint: Array, begins_us: NDArray[np.int64], now_us: NDArray[np.int64]) -> Array:
+    """Return the newest of the setpoints (n, k, 4) that has begun; the oldest if none has."""
+    begun = begins_us <= now_us[:, None]
+    begun[:, -1] = True
+    found: Array = setpoint[np.arange(len(setpoint)), begun.argmax(axis=1)]
+    return found
 
 
 class _Mount:

@@ -1,14 +1,15 @@
 """First-order response of a vehicle to velocity setpoints, from its step responses.
 
 After a dead time d a first-order lag with time constant T has completed the share p of a step at d
-- T ln(1 - p). Dead time and time constants are the least-squares fit to the times of 10, 50 and 90
-% in the flown steps.
+- T ln(1 - p). Dead times and time constants are least-squares fits to the times of 10 and 50 % of
+the velocity, and of 10, 50 and 90 % of the yaw rate in the flown steps: a policy sends its next
+setpoint before the velocity reaches 90 %.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -70,19 +71,19 @@ def load_steps(source: str) -> Mapping[StepName, StoredStep]:
 def fit_response(steps: Mapping[StepName, StoredStep], vehicle: VehicleProfile) -> Response:
     """Return the response of a vehicle from its steps.
 
-    The dead time belongs to the velocity; the yaw rate is fitted with a separate, shorter one, so
-    that its time constant is correct. Lean at constant velocity gives the linear drag.
+    Lean at constant velocity gives the linear drag.
 
     Raises:
-        UsageError: A velocity step or the yaw rate's did not reach 90 %.
+        UsageError: No velocity step reached 50 %, or the yaw rate's not 90 %.
     """
-    dead_s, lag_s = _lag(steps, VELOCITY_STEPS)
-    _, turn_lag_s = _lag(steps, (YAW_RATE_STEP,))
+    dead_s, lag_s = _lag(steps, VELOCITY_STEPS, (0.1, 0.5))
+    turn_dead_s, turn_lag_s = _lag(steps, (YAW_RATE_STEP,), (0.1, 0.5, 0.9))
     return validated(
         Response,
         {
             "dead_time_s": round(dead_s, DIGITS),
             "velocity_time_s": round(lag_s, DIGITS),
+            "yaw_rate_dead_time_s": round(turn_dead_s, DIGITS),
             "yaw_rate_time_s": round(turn_lag_s, DIGITS),
             "drag_1_s": round(vehicle.drag.linear_n_s_m / vehicle.body.mass_kg, DIGITS),
         },
@@ -90,16 +91,20 @@ def fit_response(steps: Mapping[StepName, StoredStep], vehicle: VehicleProfile) 
     )
 
 
-def _lag(steps: Mapping[StepName, StoredStep], names: tuple[StepName, ...]) -> tuple[float, float]:
-    """Return dead time and time constant [s] of the named steps together."""
+def _lag(
+    steps: Mapping[StepName, StoredStep], names: Sequence[StepName], shares: Sequence[float]
+) -> tuple[float, float]:
+    """Return dead time and time constant [s] of the named steps, from the times of the shares."""
     lags, times_s = [], []
     for name in names:
         step = steps.get(name, StoredStep())
-        if step.t10_s is None or step.t50_s is None or step.rise_s is None:
-            continue
-        lags += [-math.log(1.0 - share) for share in (0.1, 0.5, 0.9)]
-        times_s += [step.t10_s, step.t50_s, step.t10_s + step.rise_s]
+        late_s = None if None in (step.t10_s, step.rise_s) else step.t10_s + step.rise_s
+        found = {0.1: step.t10_s, 0.5: step.t50_s, 0.9: late_s}
+        if all(found[share] is not None for share in shares):
+            lags += [-math.log(1.0 - share) for share in shares]
+            times_s += [found[share] for share in shares]
     if not lags:
-        raise UsageError(f"steps: accepted: with {' or '.join(names)}, up to 90 % of it")
+        reached = f"up to {max(shares):.0%} of it"
+        raise UsageError(f"steps: accepted: with {' or '.join(names)}, {reached}")
     dead_s, lag_s = np.linalg.lstsq(np.vander(lags, 2, increasing=True), times_s, rcond=None)[0]
     return float(dead_s), float(lag_s)

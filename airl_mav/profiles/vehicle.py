@@ -492,9 +492,10 @@ class Response(ProfileModel):
     """
 
     dead_time_s: float = quantity(
-        "setpoint accepted until the vehicle begins to answer", "s", ge=0, le=2
+        "setpoint accepted until the velocity begins to answer", "s", ge=0, le=2
     )
     velocity_time_s: float = quantity("time constant of the velocity", "s", gt=0, le=10)
+    yaw_rate_dead_time_s: float = quantity("dead time of the yaw rate", "s", ge=0, le=2)
     yaw_rate_time_s: float = quantity("time constant of the yaw rate", "s", gt=0, le=10)
     drag_1_s: float = quantity(
         "deceleration that it leans against, per speed", "1/s", ge=0, le=5, default=0.0

@@ -83,9 +83,12 @@ def test_of_steps_that_disagree_it_is_the_least_squares_fit() -> None:
     found = fit_response(steps, QUAD)
     lags = [-math.log(1.0 - share) for share in (0.1, 0.5, 0.9)]
     times = np.column_stack([t10_s, t50_s, t10_s + rise_s])
-    lag_s, dead_s = np.polyfit(lags * 2, times[:2].ravel(), 1)
+    # The velocity by 10 and 50 %, the yaw rate also by 90 %.
+    lag_s, dead_s = np.polyfit(lags[:2] * 2, times[:2, :2].ravel(), 1)
     assert (found.dead_time_s, found.velocity_time_s) == pytest.approx((dead_s, lag_s), abs=5e-4)
-    assert found.yaw_rate_time_s == pytest.approx(np.polyfit(lags, times[2], 1)[0], abs=5e-4)
+    turn = np.polyfit(lags, times[2], 1)
+    assert found.yaw_rate_time_s == pytest.approx(turn[0], abs=5e-4)
+    assert found.yaw_rate_dead_time_s == pytest.approx(turn[1], abs=5e-4)
 
 
 def test_the_shipped_quad_has_what_the_script_prints(
@@ -106,13 +109,16 @@ def test_the_shipped_quad_has_what_the_script_prints(
     [("north", "accepted: with north-2 or"), ("yawspeed-30", "accepted: with yawspeed-30, up to")],
 )
 def test_without_its_steps_nothing_is_found(left_out: str, words: str) -> None:
-    """A step that does not reach 90 % does not count."""
+    """A step does not count that does not reach 50 %, of the yaw rate 90 %."""
     horizontal = ("north", "east", "forward")
     left = horizontal if left_out == "north" else (left_out,)
     all_steps = {
-        name: StoredStep(t10_s=0.2, t50_s=0.5, rise_s=None if name.startswith(left) else 1.0)
+        name: StoredStep(t10_s=0.2, t50_s=0.5, rise_s=1.0)
         for name in STEPS
+        if not name.startswith(left)
     }
+    if left_out == "yawspeed-30":
+        all_steps[left_out] = StoredStep(t10_s=0.2, t50_s=0.5, rise_s=None)
     with pytest.raises(UsageError, match=words):
         fit_response(all_steps, QUAD)
 

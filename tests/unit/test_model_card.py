@@ -69,6 +69,7 @@ def test_a_result_that_is_added_appears_on_the_page(folder: Path) -> None:
 
 
 def test_weak_arenas_are_on_the_page_and_warned_of(folder: Path) -> None:
+    write_card(folder, read_card(folder).model_copy(update={"results": ()}))
     weak = MeasuredResult(arena="crowded", level="gym", episodes=200, seed=1, success_rate=0.62)
     add_result(folder, weak)
     late = {"arena": "rooms", "latency": "400ms", "success_rate": 0.1}

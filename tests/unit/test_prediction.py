@@ -15,7 +15,7 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.errors import FieldError
-from airl_mav.core.frames import quat_from_euler, quat_to_matrix
+from airl_mav.core.frames import quat_from_euler, quat_to_matrix, quats_to_euler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction import (
     LINK_US,
@@ -34,7 +34,13 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Response, load_vehicle
 
 QUAD = load_vehicle("quad")
-RESPONSE = Response(dead_time_s=0.2, velocity_time_s=0.45, yaw_rate_time_s=0.1, drag_1_s=0.15)
+RESPONSE = Response(
+    dead_time_s=0.2,
+    velocity_time_s=0.45,
+    yaw_rate_dead_time_s=0.12,
+    yaw_rate_time_s=0.1,
+    drag_1_s=0.15,
+)
 LENS = Intrinsics.of(QUAD.camera)
 RANGE_M = QUAD.camera.range_m
 US_PER_S = 1_000_000
@@ -330,6 +336,25 @@ def test_where_nothing_is_late_a_hover_is_as_it_is() -> None:
     assert np.array_equal(then.position, now.position)
     assert np.array_equal(then.velocity, now.velocity)
     assert then.quaternion == pytest.approx(now.quaternion, abs=1e-12)
+
+
+def test_the_yaw_rate_answers_sooner_than_the_velocity() -> None:
+    vehicle = QUAD.model_copy(update={"response": RESPONSE})
+    compensator = Compensator(1, vehicle, LENS)
+    compensator.begin(0)
+    one, command = np.array([0]), np.array([3.0, 0.0, 0.0, 0.9])
+    compensator.decided(one, command[None], times(300_000), times(0))
+    row = np.array([0.0, 0.0, -2.5, 0.0, 0.0, 0.0, 0.2, 0.0])
+    blank = np.zeros((1, LENS.height, LENS.width), np.uint16)
+    _, then = compensator.foresee(one, blank, times(0), times(0), states(row[None]))
+    turns_s, flies_s = RESPONSE.yaw_rate_dead_time_s, RESPONSE.dead_time_s
+    turned = integrated(row, np.array([0, 0, 0, 0.9]), flies_s - turns_s, RESPONSE)
+    expected = integrated(turned, command, 0.3 - flies_s, RESPONSE)
+    _, _, heading = quats_to_euler(then.quaternion)
+    assert heading[0] == pytest.approx(expected[6], abs=1e-6)
+    assert then.velocity[0] == pytest.approx(expected[3:6], abs=0.02)
+    # With one dead time for both the heading would be behind.
+    assert heading[0] - 0.2 > 1.5 * (integrated(row, command, 0.3 - flies_s, RESPONSE)[6] - 0.2)
 
 
 @pytest.mark.parametrize("stopped_us", [10**9, 500_000])

@@ -79,7 +79,8 @@ def overrides_of(
             "drag_1_s": air.drag_1_s,
         }
         for key, value in table.model_dump().items():
-            found.append(Override("response", key, _round(value), _remark(fitted[key])))
+            if key in fitted:
+                found.append(Override("response", key, _round(value), _remark(fitted[key])))
     return (*found, *_parameters(profile, logged))
 
 

@@ -66,7 +66,9 @@ class ResponseFit:
         merged = {name: held.get(name) if value is None else value for name, value in found.items()}
         if any(value is None for value in merged.values()):
             return None
-        return Response.model_validate({**merged, "drag_1_s": drag_1_s})
+        turn_dead_s = held.get("yaw_rate_dead_time_s", merged["dead_time_s"])
+        rest = {"yaw_rate_dead_time_s": turn_dead_s, "drag_1_s": drag_1_s}
+        return Response.model_validate(merged | rest)
 
 
 @dataclass(frozen=True)
