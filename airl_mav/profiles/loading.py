@@ -29,15 +29,6 @@ else:
     import tomli as tomllib
 
 Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "conformance", "published"]
-_SINGULAR: dict[Kind, str] = {
-    "vehicles": "vehicle",
-    "computers": "computer",
-    "arenas": "arena",
-    "training": "training",
-    "sweeps": "sweep",
-    "conformance": "conformance",
-    "published": "publication",
-}
 Model = TypeVar("Model", bound=BaseModel)
 
 MOST_BYTES = 1 << 20
@@ -113,9 +104,9 @@ def _path(kind: Kind, name: str) -> Path:
     """Return the file of a profile. Raises UsageError if missing."""
     path = Path(name) if name.endswith(".toml") else profiles_dir() / kind / f"{name}.toml"
     if not path.is_file():
-        known = ", ".join(list_profiles(kind))
+        singular, known = kind.removesuffix("s"), ", ".join(list_profiles(kind))
         raise UsageError(
-            f"no {_SINGULAR[kind]} profile {shown(name)}; shipped: {known} (or a path to a .toml)"
+            f"no {singular} profile {shown(name)}; shipped: {known} (or a path to a .toml)"
         )
     return path
 

@@ -127,6 +127,10 @@ class Px4Release:
     unknown_mode: str
     """Answer to a mode that PX4 does not know, a MAV_RESULT."""
     failsafes: FailsafeRules
+    unknown_events: frozenset[str]
+    """Events of other releases that this release does not send."""
+    events: Mapping[str, Mapping[str, str]]
+    """Events and texts that differ from the current release, by the event's name there."""
     specs: tuple[ParameterSpec, ...]
     """Parameters in ascending order of the names."""
 
@@ -182,10 +186,11 @@ def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
     current_names = {own: current for current, own in facts["renamed"].items()}
     rows = _rows(_folder(CURRENT) / "parameters.csv") | _rows(_folder(name) / "parameters.csv")
     specs = (_spec(r, current_names.get(n, n)) for n, r in sorted(rows.items()) if r["type"])
-    unknown = frozenset(facts["unknown_commands"].values())
-    rules = FailsafeRules(**facts["failsafes"])
-    version, source, unknown_mode = facts["version"], facts["source"], facts["unknown_mode"]
-    return Px4Release(name, version, source, unknown, unknown_mode, rules, tuple(specs))
+    unknown, absent = facts["unknown_commands"].values(), facts["unknown_events"]
+    return Px4Release(
+        *(name, facts["version"], facts["source"], frozenset(unknown), facts["unknown_mode"]),
+        *(FailsafeRules(**facts["failsafes"]), frozenset(absent), facts["events"], tuple(specs)),
+    )
 
 
 def _folder(name: str) -> Path:

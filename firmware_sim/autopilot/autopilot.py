@@ -68,8 +68,7 @@ class BuiltinAutopilot:
         self._guidance.context.missions = self._navigator.missions
         self._manual_control = interface.ManualControl(value)
         self._events: list[Told] = []
-        rules = parameters.release.failsafes
-        self.supervisor = Supervisor(value, self.estimator, rules, self._events.append)
+        self.supervisor = Supervisor(value, self.estimator, parameters.release, self._events.append)
         """Failsafe and pre-arm checks."""
         self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value, record)

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
+from firmware_sim.autopilot.events.definition import Definition, Level, MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
 
 Vector = NDArray[np.float64]
@@ -37,17 +37,8 @@ class Landed(IntEnum):
     LANDING = 3
 
 
-class Severity(IntEnum):
-    """MAV_SEVERITY of a STATUSTEXT."""
-
-    EMERGENCY = 0
-    ALERT = 1
-    CRITICAL = 2
-    ERROR = 3
-    WARNING = 4
-    NOTICE = 5
-    INFO = 6
-    DEBUG = 7
+Severity = Level
+"""MAV_SEVERITY of a STATUSTEXT: the levels of events up to DEBUG."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -365,12 +365,16 @@ class Drain:
 
 
 @pytest.mark.parametrize(
-    ("release", "warned"), [("1.16", [(Severity.CRITICAL, "Failsafe activated")]), ("1.17", [])]
+    ("release", "severity", "warned"),
+    [
+        ("1.16", Severity.EMERGENCY, [(Severity.CRITICAL, "Failsafe activated")]),
+        ("1.17", Severity.CRITICAL, []),
+    ],
 )
 def test_battery_levels_are_said_once_each(
-    release: PX4ReleaseName, warned: list[tuple[Severity, str]]
+    release: PX4ReleaseName, severity: Severity, warned: list[tuple[Severity, str]]
 ) -> None:
-    """From PX4 1.17 on, a warning of the failsafes is an event alone."""
+    """From PX4 1.17 on, a warning is an event alone, and only an empty battery an emergency."""
     vehicle = load_vehicle("quad", release)
     with flight(SEED, vehicle=vehicle, parameters={"COM_LOW_BAT_ACT": 0}) as rig:
         drain = Drain(rig)
@@ -383,9 +387,9 @@ def test_battery_levels_are_said_once_each(
 
         drain.remaining, drain.per_s = 0.16, 0.008
         rig.run(16.0, note)
-        assert [(severity, text) for severity, text, _ in said] == [
-            *[(Severity.EMERGENCY, LOW), *warned],
-            *[(Severity.EMERGENCY, CRITICAL), *warned],
+        assert [(each, text) for each, text, _ in said] == [
+            *[(severity, LOW), *warned],
+            *[(severity, CRITICAL), *warned],
             *[(Severity.EMERGENCY, EMERGENCY), *warned],
         ]
         levels = [level for level in (0.15, 0.07, 0.05) for _ in range(1 + len(warned))]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from enum import Enum, auto
+from functools import partial
 
 from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
@@ -76,18 +77,11 @@ _LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
 MISSION_EXECUTE = define("mission_execute", "Executing Mission")
 MISSION_FINISHED = define("mission_finished", "Mission finished, landed")
 MISSION_FINISHED_LOITER = define("mission_finished_loiter", "Mission finished, loitering")
-MISSION_REFUSED = define(
-    "mission_not_valid_refuse",
-    "No valid mission available, refusing takeoff",
-    level=Level.ERROR,
-    internal=Level.DISABLED,
+_invalid = partial(define, level=Level.ERROR, internal=Level.DISABLED)
+MISSION_REFUSED = _invalid(
+    "mission_not_valid_refuse", "No valid mission available, refusing takeoff"
 )
-MISSION_LOITER = define(
-    "mission_not_valid_loiter",
-    "No valid mission available, loitering",
-    level=Level.ERROR,
-    internal=Level.DISABLED,
-)
+MISSION_LOITER = _invalid("mission_not_valid_loiter", "No valid mission available, loitering")
 MISSION_CLIMB = define(
     "mission_climb_before_start", "Climb to {1:.1m_v} above home", "float mission_init_climb_alt"
 )
