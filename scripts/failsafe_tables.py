@@ -171,6 +171,8 @@ def releases() -> str:
         rows.append((text, *map(_rule, values)))
     unknown = [", ".join(_command(n) for n in sorted(each.unknown_commands)) for each in found]
     rows.append(("unsupported commands", *(text or "–" for text in unknown)))
+    states = ("yes" if release.mission_state else "no" for release in found)
+    rows.append(("a return completes a mission, and MISSION_CURRENT has its state", *states))
     events = {each.name: each for each in all_definitions()}
     names_of = (frozenset(each.events) | each.unknown_events for each in found)
     for name in sorted(frozenset().union(*names_of)):

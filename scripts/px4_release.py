@@ -193,7 +193,7 @@ TEXT_BEFORE = re.compile(r"""send_statustext_\w+\("([^"]*)"\);\s*events::send[^;
 
 
 def events(tree: Path, release: str) -> dict[str, Any]:
-    """Return the events of this simulator that a release lacks, and those that differ there."""
+    """Return the events that a release lacks or changes, and if it reports a mission's state."""
     found: dict[str, dict[str, str]] = {}
     for path in sorted((tree / "src").rglob("*.[ch]pp")):
         code = path.read_text(errors="replace")
@@ -226,7 +226,13 @@ def events(tree: Path, release: str) -> dict[str, Any]:
         change = {key: there[key] for key in own if there.get(key, own[key]) != own[key]}
         if change:
             changed[name] = change
-    return {"unknown_events": absent, "events": changed}
+    modules = tree / "src/modules"
+    reported = "wpc.mission_state" in (modules / "mavlink/mavlink_mission.cpp").read_text()
+    # Both came with PX4 1.17.
+    completes = "_RETURN_TO_LAUNCH:" in (modules / "navigator/mission_block.cpp").read_text()
+    if completes is not reported:
+        raise UsageError(f"{tree}: accepted: a mission's state with returns that complete it")
+    return {"mission_state": reported, "unknown_events": absent, "events": changed}
 
 
 def _event(match: re.Match[str], code: str) -> dict[str, str]:
@@ -308,7 +314,8 @@ TABLES = {
 
 def write_facts(file: Path, facts: Mapping[str, Any]) -> None:
     """Write `release.toml`."""
-    head = "".join(f'{key} = "{facts[key]}"\n' for key in ("version", "source", "unknown_mode"))
+    keys = ("version", "source", "unknown_mode", "mission_state")
+    head = "".join(f"{key} = {json.dumps(facts[key])}\n" for key in keys)
     absent = "".join(f"    {json.dumps(name)},\n" for name in facts["unknown_events"])
     head += f"# Events of other releases.\nunknown_events = [\n{absent}]\n"
     tables = (_table(name, comment, facts[name]) for name, comment in TABLES.items())

@@ -30,9 +30,6 @@ CURRENT: PX4ReleaseName = "1.17"
 OFF = "0|"
 """Prefix of a lower flown bound: zero is also allowed and turns the function off."""
 
-_OFFICIAL = 255
-"""FIRMWARE_VERSION_TYPE_OFFICIAL."""
-
 
 class ParameterSpec(NamedTuple):
     """One parameter: its type follows from the default (int = INT32, float = FLOAT)."""
@@ -126,6 +123,8 @@ class Px4Release:
     """Commands (MAV_CMD) of other releases that this release does not support."""
     unknown_mode: str
     """Answer to a mode that PX4 does not know, a MAV_RESULT."""
+    mission_state: bool
+    """True if MISSION_CURRENT has the mission's state, and a return at its end completes it."""
     failsafes: FailsafeRules
     unknown_events: frozenset[str]
     """Events of other releases that this release does not send."""
@@ -136,8 +135,8 @@ class Px4Release:
 
     @property
     def flight_sw_version(self) -> int:
-        """Version as in AUTOPILOT_VERSION: major, minor, patch, type of release, a byte each."""
-        return int.from_bytes((*map(int, self.version.split(".")), _OFFICIAL), "big")
+        """Version as in AUTOPILOT_VERSION, a byte each: major, minor, patch, 255 (official)."""
+        return int.from_bytes((*map(int, self.version.split(".")), 255), "big")
 
     @cached_property
     def spec_by_name(self) -> Mapping[str, ParameterSpec]:
@@ -189,7 +188,8 @@ def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
     unknown, absent = facts["unknown_commands"].values(), facts["unknown_events"]
     return Px4Release(
         *(name, facts["version"], facts["source"], frozenset(unknown), facts["unknown_mode"]),
-        *(FailsafeRules(**facts["failsafes"]), frozenset(absent), facts["events"], tuple(specs)),
+        *(facts["mission_state"], FailsafeRules(**facts["failsafes"]), frozenset(absent)),
+        *(facts["events"], tuple(specs)),
     )
 
 

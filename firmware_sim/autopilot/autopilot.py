@@ -56,6 +56,7 @@ class BuiltinAutopilot:
         """Parameter store."""
         self.plans = Plans()
         """Mission, geofence and rally points stored on board."""
+        self.plans.has_state = parameters.release.mission_state
         value = parameters.value
         self.estimator = Estimator(value, new_filter)
         """Estimator, public for consistency checks."""
