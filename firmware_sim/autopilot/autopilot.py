@@ -184,7 +184,9 @@ class BuiltinAutopilot:
         looks = time_us >= supervisor.next_us
         if looks:
             self._commander.look()
-        due = self._auto_disarm.event(self._commander.flight, time_us, idle=self._demand is None)
+        thrust = 0.0 if self._demand is None else getattr(self._demand, "thrust", 1.0)
+        idle = self._land_detector.carries(thrust)
+        due = self._auto_disarm.event(self._commander.flight, time_us, idle=idle)
         if due is not None:
             self._commander.handle(due)
         if looks or time_us >= self._navigator.due_us:

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from airl_mav.control.demand import AttitudeDemand
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.px4_release import PX4ReleaseName
 from airl_mav.profiles.vehicle import load_vehicle
@@ -339,6 +340,28 @@ def test_kill_in_the_air_cuts_the_motors() -> None:
         assert rig.until(lambda: bool(rig.sim.plant.collisions), 2.0) < 1.2
         rig.run(1.0)
         assert rig.ap.flight.phase is FlightPhase.STANDBY
+
+
+def test_a_landing_in_offboard_attitude_disarms() -> None:
+    """As in PX4, COM_DISARM_LAND counts although the motors idle."""
+    with flight(SEED) as rig:
+        rig.take_off(2.0)
+
+        def hold(thrust: float, seconds: float) -> None:
+            for _ in range(round(seconds / 0.05)):
+                level = AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.0, thrust)
+                rig.ap.offer_attitude(level, rig.sim.time_us)
+                rig.run(0.05)
+
+        hold(0.5, 0.1)
+        assert rig.ap.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+        hold(0.0, 3.0)
+        assert rig.ap.flight.phase is FlightPhase.GROUND
+        hold(0.4, 3.0)  # too much thrust for a vehicle that has landed
+        assert rig.ap.flight.phase is FlightPhase.GROUND
+        hold(0.0, 2.2)
+        assert int(rig.ap.flight.phase) < FlightPhase.GROUND
+        assert rig.said("Disarmed by landing") > rig.said("Landing detected") + 5.0
 
 
 # --- battery
