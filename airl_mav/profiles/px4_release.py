@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.loading import profiles_dir, read_toml
+from airl_mav.profiles.loading import list_profiles, profiles_dir, read_toml
 
 PX4ReleaseName = Literal["1.16", "1.17", "1.18"]
 
@@ -191,6 +192,27 @@ def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
         *(facts["mission_state"], FailsafeRules(**facts["failsafes"]), frozenset(absent)),
         *(facts["events"], tuple(specs)),
     )
+
+
+def version_name(flight_sw_version: int) -> str:
+    """Return AUTOPILOT_VERSION.flight_sw_version as 1.16.0 alpha; its last byte is the stage."""
+    major, minor, patch, stage = flight_sw_version.to_bytes(4, "big")
+    stages = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
+    return f"{major}.{minor}.{patch}" + next(name for least, name in stages if stage >= least)
+
+
+def stored_release(firmware: str, flight_sw_version: int) -> tuple[str, str]:
+    """Return the column of a release of PX4 or ArduPilot, or the nearest one, and a title."""
+    title = f"{firmware} {version_name(flight_sw_version)}"
+    distances = {}
+    for name in list_profiles("conformance"):
+        if found := re.fullmatch(rf"{firmware.lower()}-(\d+)\.(\d+)", name):
+            release = int(found[1]) << 8 | int(found[2])
+            distances[name] = abs(release - (flight_sw_version >> 16))
+    nearest = min(distances, key=distances.__getitem__, default="")
+    if not distances.get(nearest):
+        return nearest, title
+    return nearest, f"{title}: no column; compared with {nearest.rpartition('-')[2]}"
 
 
 def _folder(name: str) -> Path:
