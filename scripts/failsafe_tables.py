@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import get_args
 
-from airl_mav.profiles.px4_release import ParameterSpec, PX4ReleaseName, px4_release
+from airl_mav.profiles.px4_release import (
+    CURRENT,
+    ParameterSpec,
+    Px4Release,
+    PX4ReleaseName,
+    px4_release,
+)
+from firmware_sim.addons.ground_station_services.component_metadata import all_definitions
 from firmware_sim.autopilot import prearm
-from firmware_sim.autopilot.events.definition import FailsafeAction, words
+from firmware_sim.autopilot.events.definition import Definition, FailsafeAction, words
 from firmware_sim.autopilot.failsafes.failsafe_conditions import (
     Clear,
     Options,
@@ -124,7 +131,8 @@ def needs() -> str:
 
 def checks() -> str:
     """Return the pre-arm checks in reporting order."""
-    rows = ((check.text, words(check.component), _told(check)) for check in prearm.CHECKS)
+    found = prearm.checks(CURRENT)
+    rows = ((check.text, words(check.component), _told(check)) for check in found)
     return _table(("text", "component", "told"), rows)
 
 
@@ -163,7 +171,30 @@ def releases() -> str:
         rows.append((text, *map(_rule, values)))
     unknown = [", ".join(_command(n) for n in sorted(each.unknown_commands)) for each in found]
     rows.append(("unsupported commands", *(text or "–" for text in unknown)))
+    states = ("yes" if release.mission_state else "no" for release in found)
+    rows.append(("a return completes a mission, and MISSION_CURRENT has its state", *states))
+    events = {each.name: each for each in all_definitions()}
+    names_of = (frozenset(each.events) | each.unknown_events for each in found)
+    for name in sorted(frozenset().union(*names_of)):
+        rows.append((f"`{name}`", *(_event(events[name], release) for release in found)))
     return _table(("", *names), rows)
+
+
+def _event(event: Definition, release: Px4Release) -> str:
+    """Return what a release sends for an event, by its name in the current one."""
+    if event.name in release.unknown_events:
+        return "–"
+    change = release.events.get(event.name, {})
+    checks = [
+        c for c in prearm.checks(release.name) if c.event.name == change.get("name", event.name)
+    ]
+    text = change.get("text", checks[0].text if checks else event.message)
+    severity = change.get("severity", checks[0].severity.name if checks else "").lower()
+    details = [f"`{change['name']}`"] if "name" in change else []
+    details += ["level by charge"] if "grades" in change else []
+    if "needs" in change:
+        details.append(f"modes with {change['needs'].split()[0].lower().replace('_', ' ')}")
+    return ", ".join((f"{text} ({severity})" if severity else text, *details))
 
 
 def _cell(spec: ParameterSpec | None, name: str) -> str:

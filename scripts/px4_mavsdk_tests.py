@@ -370,7 +370,7 @@ def jump(v: Vehicle) -> None:
     disarmed(v, 240.0)
 
 
-@test("RTL direct with geofence obstruction", since=(1, 18))
+@test("RTL direct with geofence obstruction", since=(1, 19))
 def return_around_a_fence(v: Vehicle) -> None:
     """Return around an exclusion polygon on the straight way home."""
     ready(v)

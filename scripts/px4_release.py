@@ -4,6 +4,7 @@
     make px4_sitl_default                                     # in PX4's source tree
     airl-sitl --level lockstep --firmware px4 --px4-dir TREE --episodes 1 --out RUN
     scripts/px4_release.py 1.17 TREE RUN/flight-000.ulg
+    scripts/px4_release.py 1.17 TREE                          # events alone: needs no build
 
 The build has types, ranges and units of all parameters, the log those that PX4 uses with airframe
 10016, and their values after boot. Write the current release first: the others are differences.
@@ -23,9 +24,11 @@ from typing import Any, get_args
 from pyulog import ULog
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.loading import load_profile, read_toml
 from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
 from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.addons.ground_station_services.component_metadata import all_definitions
+from firmware_sim.autopilot import prearm
 from firmware_sim.mavlink import services
 from firmware_sim.mavlink.codec import dialect
 
@@ -123,8 +126,14 @@ def unknown_commands(tree: Path) -> dict[str, int]:
 
 
 def _table(name: str, comment: str, values: Mapping[str, object]) -> str:
-    rows = "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+    rows = "".join(f"{key} = {_value(value)}\n" for key, value in values.items())
     return f"\n# {comment}\n[{name}]\n{rows}"
+
+
+def _value(value: object) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {json.dumps(text)}" for key, text in value.items()) + " }"
+    return json.dumps(value)
 
 
 FAILSAFES = {
@@ -152,6 +161,103 @@ def failsafes(tree: Path, release: str) -> dict[str, bool | int]:
     found["delays_from"] = sum(f"Action::{name} " in names for name in ("None", "Warn"))
     found["warning_has_text"] = "if (action != Action::Warn) {" not in code
     return found | LATER.get(release, {})
+
+
+# --- events
+
+
+RENAMED_EVENTS = {"1.18": {"mavlink_mission_op_timeout": "mavlink_mission_sync_timeout"}}
+"""Names in a release of events that this simulator sends, by their name in the current one."""
+
+NEEDS = dict.fromkeys(
+    ("check_estimator_heading_not_stable", "check_estimator_missing_data"), "ATTITUDE"
+)
+"""Requirement of the modes that a check blocks, in the code; other checks block all modes."""
+
+EVENT = re.compile(
+    r"""events::ID\("(?P<name>\w+)"\)\s*,\s*(?P<level>\{[^}]*\}|[\w:]+)\s*,\s*
+    "(?P<message>[^"]*)"[^;]*;""",
+    re.VERBOSE,
+)
+"""Event in PX4's code."""
+
+TEXT_AFTER = re.compile(
+    r"""(?:\s*reporter\.clearCanRunBits[^;]*;)?\s*if\s*\([^;{}]*mavlink_log_pub\(\)\)\s*\{
+    \s*mavlink_log_(?P<severity>\w+)\([^"]*"(?P<text>[^"]*)\"""",
+    re.VERBOSE,
+)
+"""Text of a check, after its event."""
+
+TEXT_BEFORE = re.compile(r"""send_statustext_\w+\("([^"]*)"\);\s*events::send[^;]*$""")
+"""Text of the mission protocol, before its event."""
+
+
+def events(tree: Path, release: str) -> dict[str, Any]:
+    """Return the events that a release lacks or changes, and if it reports a mission's state."""
+    found: dict[str, dict[str, str]] = {}
+    for path in sorted((tree / "src").rglob("*.[ch]pp")):
+        code = path.read_text(errors="replace")
+        for match in EVENT.finditer(code):
+            found.setdefault(match["name"], _event(match, code))
+    if not found:
+        raise UsageError(f"{tree}: accepted: a source tree of PX4")
+    renamed = RENAMED_EVENTS.get(release, {})
+    checks = {check.event.name: check for check in reversed(prearm.CHECKS)}
+    graded = {check.event.name for check in prearm.CHECKS if check.level is not None}
+    own_events = {event.name: event for event in all_definitions()}
+    absent, changed = [], {}
+    for name, event in sorted(own_events.items()):
+        if (there := found.get(renamed.get(name, name))) is None:
+            absent.append(name)
+            continue
+        own = {"name": name, "message": event.message, "level": event.level.name}
+        if check := checks.get(name):
+            own |= {
+                "text": check.text,
+                "severity": check.severity.name,
+                "needs": NEEDS.get(name, ""),
+            }
+            if name in graded:
+                del own["level"]
+            else:
+                own["grades"] = ""
+        elif name in renamed:
+            own["text"] = ""
+        change = {key: there[key] for key in own if there.get(key, own[key]) != own[key]}
+        if change:
+            changed[name] = change
+    modules = tree / "src/modules"
+    reported = "wpc.mission_state" in (modules / "mavlink/mavlink_mission.cpp").read_text()
+    # Both came with PX4 1.17.
+    completes = "_RETURN_TO_LAUNCH:" in (modules / "navigator/mission_block.cpp").read_text()
+    if completes is not reported:
+        raise UsageError(f"{tree}: accepted: a mission's state with returns that complete it")
+    return {"mission_state": reported, "unknown_events": absent, "events": changed}
+
+
+def _event(match: re.Match[str], code: str) -> dict[str, str]:
+    """Return an event in PX4's code in this simulator's terms."""
+    begin = max(code.rfind(sign, 0, match.start()) for sign in ";{}")
+    call, after = code[begin : match.start()], TEXT_AFTER.match(code, match.end())
+    # Two arguments of a check precede those of its message.
+    first = 3 if "reporter" in call else 1
+    level = re.search(r"Log::(\w+)", match["level"])
+    found = {
+        "name": match["name"],
+        "message": re.sub(r"\{(\d)", lambda m: f"{{{int(m[1]) + first - 1}", match["message"]),
+    }
+    found |= {"level": level[1].upper()} if level else {"grades": "charge"}
+    # Single sensors here: number 0. Motors count from 1 on.
+    if after:
+        text = re.sub(r"%[ud]", "1" if "Motor" in after["text"] else "0", after["text"])
+        found |= {"text": text.removesuffix("\\t"), "severity": after["severity"].upper()}
+    elif before := TEXT_BEFORE.search(code[: match.start()]):
+        found["text"] = before[1].removesuffix("\\t")
+    if modes := re.search(r"\((\w+_groups),", call):
+        listed = re.search(rf"{modes[1]} = \(NavModes\)([^;]*);", code)
+        names = re.findall(r"mode_req_(\w+)", listed[1]) if listed else ()
+        found["needs"] = " ".join(names).upper()
+    return found
 
 
 def source(tree: Path) -> str:
@@ -184,28 +290,57 @@ def write(release: PX4ReleaseName, tree: Path, log: Path) -> None:
         listed = differences(rows, read(PX4 / CURRENT / "parameters.csv"))
     with (folder / "parameters.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([COLUMNS, *listed])
-    renamed, unknown = RENAMED.get(release, {}), unknown_commands(tree)
-    (folder / "release.toml").write_text(
-        f'version = "{release}.0"\nsource = "{source(tree)}"\n'
-        f'unknown_mode = "{UNKNOWN_MODE.get(release, "ACCEPTED")}"\n'
-        + _table("renamed", "Names in this release, by the name in the current one.", renamed)
-        + _table(
-            "failsafes", "Rules of the failsafes, see FailsafeRules.", failsafes(tree, release)
-        )
-        + _table("unknown_commands", "Commands that this release does not support.", unknown),
-        encoding="utf-8",
-    )
+    facts = {
+        "version": f"{release}.0",
+        "source": source(tree),
+        "unknown_mode": UNKNOWN_MODE.get(release, "ACCEPTED"),
+        "renamed": RENAMED.get(release, {}),
+        "failsafes": failsafes(tree, release),
+        "unknown_commands": unknown_commands(tree),
+        **events(tree, release),
+    }
+    write_facts(folder / "release.toml", facts)
     print(f"{folder}: {len(rows)} parameters")
+
+
+TABLES = {
+    "renamed": "Names in this release, by the name in the current one.",
+    "failsafes": "Rules of the failsafes, see FailsafeRules.",
+    "unknown_commands": "Commands that this release does not support.",
+    "events": "Events and texts that differ from the current release.",
+}
+"""Tables of `release.toml` and their comments."""
+
+
+def write_facts(file: Path, facts: Mapping[str, Any]) -> None:
+    """Write `release.toml`."""
+    keys = ("version", "source", "unknown_mode", "mission_state")
+    head = "".join(f"{key} = {json.dumps(facts[key])}\n" for key in keys)
+    absent = "".join(f"    {json.dumps(name)},\n" for name in facts["unknown_events"])
+    head += f"# Events of other releases.\nunknown_events = [\n{absent}]\n"
+    tables = (_table(name, comment, facts[name]) for name, comment in TABLES.items())
+    file.write_text(head + "".join(tables), encoding="utf-8")
+
+
+def update_events(release: PX4ReleaseName, tree: Path) -> None:
+    """Write the events of a release again from a source tree."""
+    file = PX4 / release / "release.toml"
+    write_facts(file, read_toml(file) | events(tree, release))
 
 
 def main() -> int:
     """Write the release named on the command line."""
-    if len(sys.argv) != 4 or not re.fullmatch("|".join(get_args(PX4ReleaseName)), sys.argv[1]):
-        print(f"usage: px4_release.py {'|'.join(get_args(PX4ReleaseName))} TREE LOG.ulg")
+    if len(sys.argv) not in (3, 4) or not re.fullmatch(
+        "|".join(get_args(PX4ReleaseName)), sys.argv[1]
+    ):
+        print(f"usage: px4_release.py {'|'.join(get_args(PX4ReleaseName))} TREE [LOG.ulg]")
         return 2
-    release, tree, log = sys.argv[1:]
+    release, tree, *log = sys.argv[1:]
     try:
-        write(release, Path(tree), Path(log))  # type: ignore[arg-type]  # matched above
+        if log:
+            write(release, Path(tree), Path(*log))  # type: ignore[arg-type]  # matched above
+        else:
+            update_events(release, Path(tree))  # type: ignore[arg-type]
     except (OSError, UsageError, subprocess.CalledProcessError) as error:
         print(f"px4_release.py: {error}")
         return 2

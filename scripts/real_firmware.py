@@ -34,8 +34,8 @@ from airl_mav.addons.conformance.telemetry import StepResponse
 from airl_mav.core.child_process import ChildProcess, terminated_as_interrupted
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, UsageError
 from airl_mav.flight.statistics import Estimate, compare_pairs
-from airl_mav.profiles.loading import load_profile, stored_release, version_name
-from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName, stored_release, version_name
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, RealFirmware
 from firmware_sim.external.programs import check_free, firmware_kind

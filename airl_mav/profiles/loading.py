@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -29,15 +28,6 @@ else:
     import tomli as tomllib
 
 Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "conformance", "published"]
-_SINGULAR: dict[Kind, str] = {
-    "vehicles": "vehicle",
-    "computers": "computer",
-    "arenas": "arena",
-    "training": "training",
-    "sweeps": "sweep",
-    "conformance": "conformance",
-    "published": "publication",
-}
 Model = TypeVar("Model", bound=BaseModel)
 
 MOST_BYTES = 1 << 20
@@ -58,27 +48,6 @@ def profiles_dir() -> Path:
 def list_profiles(kind: Kind) -> list[str]:
     """Return the names of the shipped profiles of a kind, sorted."""
     return sorted(path.stem for path in (profiles_dir() / kind).glob("*.toml"))
-
-
-def version_name(flight_sw_version: int) -> str:
-    """Return AUTOPILOT_VERSION.flight_sw_version as 1.16.0 alpha; its last byte is the stage."""
-    major, minor, patch, stage = flight_sw_version.to_bytes(4, "big")
-    stages = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
-    return f"{major}.{minor}.{patch}" + next(name for least, name in stages if stage >= least)
-
-
-def stored_release(firmware: str, flight_sw_version: int) -> tuple[str, str]:
-    """Return the column of a release of PX4 or ArduPilot, or the nearest one, and a title."""
-    title = f"{firmware} {version_name(flight_sw_version)}"
-    distances = {}
-    for name in list_profiles("conformance"):
-        if found := re.fullmatch(rf"{firmware.lower()}-(\d+)\.(\d+)", name):
-            release = int(found[1]) << 8 | int(found[2])
-            distances[name] = abs(release - (flight_sw_version >> 16))
-    nearest = min(distances, key=distances.__getitem__, default="")
-    if not distances.get(nearest):
-        return nearest, title
-    return nearest, f"{title}: no column; compared with {nearest.rpartition('-')[2]}"
 
 
 def describe_profile(kind: Kind, name: str) -> str:
@@ -113,9 +82,9 @@ def _path(kind: Kind, name: str) -> Path:
     """Return the file of a profile. Raises UsageError if missing."""
     path = Path(name) if name.endswith(".toml") else profiles_dir() / kind / f"{name}.toml"
     if not path.is_file():
-        known = ", ".join(list_profiles(kind))
+        singular, known = kind.removesuffix("s"), ", ".join(list_profiles(kind))
         raise UsageError(
-            f"no {_SINGULAR[kind]} profile {shown(name)}; shipped: {known} (or a path to a .toml)"
+            f"no {singular} profile {shown(name)}; shipped: {known} (or a path to a .toml)"
         )
     return path
 

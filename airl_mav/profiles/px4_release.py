@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.loading import profiles_dir, read_toml
+from airl_mav.profiles.loading import list_profiles, profiles_dir, read_toml
 
 PX4ReleaseName = Literal["1.16", "1.17", "1.18"]
 
@@ -29,9 +30,6 @@ CURRENT: PX4ReleaseName = "1.17"
 
 OFF = "0|"
 """Prefix of a lower flown bound: zero is also allowed and turns the function off."""
-
-_OFFICIAL = 255
-"""FIRMWARE_VERSION_TYPE_OFFICIAL."""
 
 
 class ParameterSpec(NamedTuple):
@@ -126,14 +124,20 @@ class Px4Release:
     """Commands (MAV_CMD) of other releases that this release does not support."""
     unknown_mode: str
     """Answer to a mode that PX4 does not know, a MAV_RESULT."""
+    mission_state: bool
+    """True if MISSION_CURRENT has the mission's state, and a return at its end completes it."""
     failsafes: FailsafeRules
+    unknown_events: frozenset[str]
+    """Events of other releases that this release does not send."""
+    events: Mapping[str, Mapping[str, str]]
+    """Events and texts that differ from the current release, by the event's name there."""
     specs: tuple[ParameterSpec, ...]
     """Parameters in ascending order of the names."""
 
     @property
     def flight_sw_version(self) -> int:
-        """Version as in AUTOPILOT_VERSION: major, minor, patch, type of release, a byte each."""
-        return int.from_bytes((*map(int, self.version.split(".")), _OFFICIAL), "big")
+        """Version as in AUTOPILOT_VERSION, a byte each: major, minor, patch, 255 (official)."""
+        return int.from_bytes((*map(int, self.version.split(".")), 255), "big")
 
     @cached_property
     def spec_by_name(self) -> Mapping[str, ParameterSpec]:
@@ -182,10 +186,33 @@ def px4_release(name: PX4ReleaseName = CURRENT) -> Px4Release:
     current_names = {own: current for current, own in facts["renamed"].items()}
     rows = _rows(_folder(CURRENT) / "parameters.csv") | _rows(_folder(name) / "parameters.csv")
     specs = (_spec(r, current_names.get(n, n)) for n, r in sorted(rows.items()) if r["type"])
-    unknown = frozenset(facts["unknown_commands"].values())
-    rules = FailsafeRules(**facts["failsafes"])
-    version, source, unknown_mode = facts["version"], facts["source"], facts["unknown_mode"]
-    return Px4Release(name, version, source, unknown, unknown_mode, rules, tuple(specs))
+    unknown, absent = facts["unknown_commands"].values(), facts["unknown_events"]
+    return Px4Release(
+        *(name, facts["version"], facts["source"], frozenset(unknown), facts["unknown_mode"]),
+        *(facts["mission_state"], FailsafeRules(**facts["failsafes"]), frozenset(absent)),
+        *(facts["events"], tuple(specs)),
+    )
+
+
+def version_name(flight_sw_version: int) -> str:
+    """Return AUTOPILOT_VERSION.flight_sw_version as 1.16.0 alpha; its last byte is the stage."""
+    major, minor, patch, stage = flight_sw_version.to_bytes(4, "big")
+    stages = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
+    return f"{major}.{minor}.{patch}" + next(name for least, name in stages if stage >= least)
+
+
+def stored_release(firmware: str, flight_sw_version: int) -> tuple[str, str]:
+    """Return the column of a release of PX4 or ArduPilot, or the nearest one, and a title."""
+    title = f"{firmware} {version_name(flight_sw_version)}"
+    distances = {}
+    for name in list_profiles("conformance"):
+        if found := re.fullmatch(rf"{firmware.lower()}-(\d+)\.(\d+)", name):
+            release = int(found[1]) << 8 | int(found[2])
+            distances[name] = abs(release - (flight_sw_version >> 16))
+    nearest = min(distances, key=distances.__getitem__, default="")
+    if not distances.get(nearest):
+        return nearest, title
+    return nearest, f"{title}: no column; compared with {nearest.rpartition('-')[2]}"
 
 
 def _folder(name: str) -> Path:

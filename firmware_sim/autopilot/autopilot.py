@@ -56,6 +56,7 @@ class BuiltinAutopilot:
         """Parameter store."""
         self.plans = Plans()
         """Mission, geofence and rally points stored on board."""
+        self.plans.has_state = parameters.release.mission_state
         value = parameters.value
         self.estimator = Estimator(value, new_filter)
         """Estimator, public for consistency checks."""
@@ -68,8 +69,7 @@ class BuiltinAutopilot:
         self._guidance.context.missions = self._navigator.missions
         self._manual_control = interface.ManualControl(value)
         self._events: list[Told] = []
-        rules = parameters.release.failsafes
-        self.supervisor = Supervisor(value, self.estimator, rules, self._events.append)
+        self.supervisor = Supervisor(value, self.estimator, parameters.release, self._events.append)
         """Failsafe and pre-arm checks."""
         self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value, record)
@@ -184,7 +184,9 @@ class BuiltinAutopilot:
         looks = time_us >= supervisor.next_us
         if looks:
             self._commander.look()
-        due = self._auto_disarm.event(self._commander.flight, time_us, idle=self._demand is None)
+        thrust = 0.0 if self._demand is None else getattr(self._demand, "thrust", 1.0)
+        idle = self._land_detector.carries(thrust)
+        due = self._auto_disarm.event(self._commander.flight, time_us, idle=idle)
         if due is not None:
             self._commander.handle(due)
         if looks or time_us >= self._navigator.due_us:

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_sim.autopilot.events.definition import Definition, MavlinkEvent
+from firmware_sim.autopilot.events.definition import Definition, Level, MavlinkEvent
 from firmware_sim.autopilot.flight_modes import Mode
 
 Vector = NDArray[np.float64]
@@ -28,26 +28,12 @@ class Arming(IntEnum):
     ARMED = 2
 
 
-class Landed(IntEnum):
-    """State of the landing detector."""
-
-    ON_GROUND = 0
-    TAKEOFF = 1
-    IN_AIR = 2
-    LANDING = 3
+Landed = IntEnum("Landed", "ON_GROUND TAKEOFF IN_AIR LANDING", start=0)
+"""State of the landing detector."""
 
 
-class Severity(IntEnum):
-    """MAV_SEVERITY of a STATUSTEXT."""
-
-    EMERGENCY = 0
-    ALERT = 1
-    CRITICAL = 2
-    ERROR = 3
-    WARNING = 4
-    NOTICE = 5
-    INFO = 6
-    DEBUG = 7
+Severity = Level
+"""MAV_SEVERITY of a STATUSTEXT: the levels of events up to DEBUG."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +135,12 @@ class CommanderStatus(NamedTuple):
     failsafe: bool
 
 
+MissionState = IntEnum(
+    "MissionState", "UNKNOWN NO_MISSION NOT_STARTED ACTIVE PAUSED COMPLETE", start=0
+)
+"""State of the mission; values are MISSION_STATE."""
+
+
 class MissionProgress(NamedTuple):
     """Progress of the mission."""
 
@@ -160,9 +152,9 @@ class MissionProgress(NamedTuple):
     """PX4's opaque mission id; 0 = none. The same applies to the two ids below."""
     fence_id: int = 0
     rally_points_id: int = 0
-
-
-NO_MISSION = MissionProgress()
+    state: MissionState = MissionState.UNKNOWN
+    mode: int = 0
+    """MISSION_MODE: 1 active, 2 suspended; 0 = unknown, as the state in PX4 1.16."""
 
 
 class FenceStatus(NamedTuple):

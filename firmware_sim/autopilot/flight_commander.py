@@ -41,7 +41,7 @@ class AutoDisarm:
     ) -> commander.CommanderEvent | None:
         """Return the event of an expired timeout, or None.
 
-        `idle`: the motors are stopped. Spool-up and take-off ramp do not count as ground time.
+        `idle`: the motors cannot lift the vehicle; spool-up and take-off ramp can.
         """
         self.due_us = math.inf
         if flight.mode is _TERMINATION and flight.phase >= _GROUND:

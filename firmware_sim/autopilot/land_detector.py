@@ -95,6 +95,10 @@ class LandDetector:
         self._record["land"] = thresholds(self._value)
         self.see(self._ground)
 
+    def carries(self, thrust: float) -> bool:
+        """Return whether the ground must carry the vehicle at a collective thrust 0..1."""
+        return bool(thrust <= self._record["land"].item(0, _CARRIED_THRUST))
+
     def see(self, ground: Clearance | None) -> None:
         """Update the height above ground; None = not measured.
 

@@ -1,15 +1,17 @@
 """Pre-arm checks with their texts, one row per check, pure.
 
-The rows also define component health for clients (SYS_STATUS). Source: PX4 1.16,
-commander/HealthAndArmingChecks, without checks of components that this vehicle lacks.
+The rows also define component health for clients (SYS_STATUS). Source: PX4 1.16 to 1.18,
+commander/HealthAndArmingChecks, without checks of components that this vehicle lacks. Texts and
+levels are those of the current release; `checks` returns those of any release.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache, partial
+from collections.abc import Callable, Mapping
+from functools import cache, lru_cache, partial
 from typing import Any, NamedTuple
 
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName, px4_release
 from firmware_sim.autopilot.autopilot_state import Severity
 from firmware_sim.autopilot.events.definition import Component, Definition, Level, arguments
 from firmware_sim.autopilot.failsafes.failsafe_conditions import BatteryWarning, Conditions
@@ -61,8 +63,13 @@ class Readiness(NamedTuple):
     pitched: bool = False
     charge_short: bool = False
     """True if the battery's charge is below COM_ARM_BAT_MIN."""
+    failed_motors: int = 0
+    """Failed motors as bits."""
+    offboard_lacks: str = ""
+    """Estimate that the newest offboard setpoint needs and that is invalid."""
     terminated: bool = False
     armed: bool = False
+    release: PX4ReleaseName = CURRENT
 
 
 class PrearmCheck(NamedTuple):
@@ -140,15 +147,15 @@ def _health(
     message: str,
     fails: Callable[[Readiness], bool],
     *,
-    numbered: bool = False,
+    number: int | None = None,
     event_level: Level = Level.ERROR,
     operator_text: str = "",
 ) -> PrearmCheck:
-    """Return a check of hardware; `numbered`: the event has the number of the sensor, 0."""
-    # Single sensors here: their instance is always 0.
-    extra = _INSTANCE if numbered else ()
+    """Return a check of hardware; `number`: the number of the part in the event."""
+    extra = () if number is None else _INSTANCE
     event = Definition(f"check_{name}", message, _ABOUT + extra, event_level, group="health")
-    return PrearmCheck(event, component, fails, operator_text, values=(0,) * len(extra))
+    values = () if number is None else (number,)
+    return PrearmCheck(event, component, fails, operator_text, values=values)
 
 
 def _no_data(
@@ -163,7 +170,7 @@ def _no_data(
         f"{name}_no_data",
         f"No valid data from {sensor} {{3}}",
         fails,
-        numbered=True,
+        number=0,
         operator_text=f"Preflight Fail: No valid data from {short} 0",
     )
 
@@ -215,7 +222,34 @@ def _fence(kind: str, name: str, message: str, parameters: str) -> PrearmCheck:
         f"Geofence violation: {message}",
         lambda r: getattr(r.conditions.geofence, kind) and r.settings.gf_action != 0,
         parameters=parameters,
-        prefix="",
+        operator_text=f"Geofence: {message}",
+    )
+
+
+def _offboard(reason: str, message: str, lacks: str = "") -> PrearmCheck:
+    """Return a requirement of an offboard signal with its reason, as since PX4 1.18."""
+    return _check(
+        _SYSTEM,
+        f"modes_offboard_{reason}",
+        message,
+        lambda r: (
+            _needs(r, Need.OFFBOARD_SIGNAL)
+            and r.conditions.offboard_control_signal_lost
+            and r.offboard_lacks == lacks
+        ),
+        announced=False,
+    )
+
+
+def _undercurrent(motor: int) -> PrearmCheck:
+    return _health(
+        _C.MOTORS_ESCS,
+        "motor_undercurrent",
+        "Motor {3} undercurrent detected",
+        lambda r: bool(r.failed_motors >> (motor - 1) & 1),
+        number=motor,
+        event_level=Level.CRITICAL,
+        operator_text=f"Motor failure: Motor {motor} undercurrent detected",
     )
 
 
@@ -231,8 +265,7 @@ def _battery(
         f"The charge is below <param>{threshold}</param>.",
         prefix="",
         blocks=_battery_blocks,
-        severity=Severity.EMERGENCY,
-        level=_battery_urgency,
+        severity=level,
     )
 
 
@@ -349,7 +382,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "distance_sensor_missing",
         "Distance sensor {3} missing",
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is None,
-        numbered=True,
+        number=0,
         operator_text="Preflight Fail: Distance Sensor 0 missing",
     ),
     _health(
@@ -357,10 +390,10 @@ CHECKS: tuple[PrearmCheck, ...] = (
         "distance_sensor_invalid",
         "No valid data from distance sensor {3}",
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is False,
-        numbered=True,
-        operator_text="Preflight Fail: no valid data from distance sensor 0",
+        number=0,
+        operator_text="Preflight Fail: No valid distance sensor 0 data",
     ),
-    _battery(BatteryWarning.LOW, "battery_low", "Low battery", _L.WARNING, "BAT_LOW_THR"),
+    _battery(BatteryWarning.LOW, "battery_low", "Low battery", _L.CRITICAL, "BAT_LOW_THR"),
     _battery(
         BatteryWarning.CRITICAL, "battery_critical", "Critical battery", _L.CRITICAL, "BAT_CRIT_THR"
     ),
@@ -368,7 +401,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         BatteryWarning.EMERGENCY,
         "battery_emergency",
         "Emergency battery level",
-        _L.CRITICAL,
+        _L.EMERGENCY,
         "BAT_EMERGEN_THR",
     ),
     _check(
@@ -388,6 +421,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _L.INFO,
         operator_text="Preflight Fail: ekf2 missing data",
         announced=False,
+        blocks=lambda r: _needs(r, Need.ATTITUDE),
     ),
     _check(
         _ESTIMATE,
@@ -396,6 +430,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
         # The check concerns arming only.
         lambda r: not r.compass_agrees and not r.armed,
         operator_text="Preflight Fail: heading estimate not stable",
+        blocks=lambda r: _needs(r, Need.ATTITUDE),
     ),
     _mag_interference(lambda r: _field_fails(r, _FIELD_REQUIRED)),
     _mag_interference(
@@ -428,9 +463,10 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _C.MOTORS_ESCS,
         "failure_detector_motor",
         "Motor failure detected",
-        lambda r: r.conditions.fd_motor_failure,
+        lambda r: bool(r.failed_motors),
         event_level=_L.CRITICAL,
     ),
+    *map(_undercurrent, range(1, 5)),
     _fence(
         "distance",
         "max_hor_dist",
@@ -461,6 +497,7 @@ CHECKS: tuple[PrearmCheck, ...] = (
     ),
     _no_gcs(
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act > 0,
+        operator_text="Preflight Fail: No connection to the GCS",
         severity=Severity.WARNING,
     ),
     _no_gcs(
@@ -562,6 +599,9 @@ CHECKS: tuple[PrearmCheck, ...] = (
         _L.ERROR,
         "Setpoints are not sent, or the commanded quantity is not estimated.",
     ),
+    _offboard("no_local_position", "Offboard requires local position", "position"),
+    _offboard("no_local_velocity", "Offboard requires local velocity", "velocity"),
+    _offboard("signal_lost", "No offboard signal"),
     _needed(
         "home_position",
         "Home position not set",
@@ -581,14 +621,39 @@ CHECKS: tuple[PrearmCheck, ...] = (
         shown=lambda r: Need.MANUAL_CONTROL if _no_sticks_wanted(r) else _ANYTHING,
     ),
 )
-"""Checks in reporting order."""
+"""Checks of all releases in reporting order."""
+
+
+@cache
+def checks(release: PX4ReleaseName) -> tuple[PrearmCheck, ...]:
+    """Return the checks of a release in reporting order."""
+    found = px4_release(release)
+    return tuple(
+        _of_release(check, found.events.get(check.event.name, {}))
+        for check in CHECKS
+        if check.event.name not in found.unknown_events
+    )
+
+
+def _of_release(check: PrearmCheck, change: Mapping[str, str]) -> PrearmCheck:
+    """Return a check with the event, text, severity and modes of another release."""
+    if "text" in change:
+        check = check._replace(operator_text=change["text"])
+    if "severity" in change:
+        check = check._replace(severity=Level[change["severity"]])
+    if "grades" in change:
+        check = check._replace(level=_battery_urgency)
+    if "needs" in change:
+        needs = [Need[name] for name in change["needs"].split()]
+        check = check._replace(blocks=lambda r: any(_needs(r, need) for need in needs))
+    return check._replace(event=check.event.of_release(change))
 
 
 @lru_cache(maxsize=256)
 def failing(readiness: Readiness) -> tuple[PrearmCheck, ...]:
     """Return the failing checks."""
     # Cached: the commander asks several times per second, and readiness rarely changes.
-    return tuple(check for check in CHECKS if check.fails(readiness))
+    return tuple(check for check in checks(readiness.release) if check.fails(readiness))
 
 
 def blocking(checks: tuple[PrearmCheck, ...], readiness: Readiness) -> tuple[PrearmCheck, ...]:

@@ -21,10 +21,8 @@ from airl_mav.core import constants, frames
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import MavlinkEvent, SensorFailure, SensorType
+from firmware_sim.engine import record as fields
 from firmware_sim.engine.record import CHANGED, FIRST, GPS_ROW, SEEN, Record
-from firmware_sim.engine.record import GPS as GPS_BIT
-from firmware_sim.engine.record import MAG as MAG_BIT
-from firmware_sim.engine.record import PRESSURE as PRESSURE_BIT
 from firmware_sim.interfaces import GpsFix, SensorSample
 
 NO_DATA_US = constants.US_PER_S
@@ -68,19 +66,11 @@ def _gps(sample: SensorSample) -> Any:
 _REASONS = {"TIMEOUT": SensorFailure.TIMEOUT, "STALE": SensorFailure.STALE_DATA}
 
 GYRO = SensorKind(
-    "GYRO",
-    "Gyro 0",
-    lambda s: tuple(s.gyro.tolist()),
-    500_000,
-    400_000,
+    *("GYRO", "Gyro 0", lambda s: tuple(s.gyro.tolist()), 500_000, 400_000),
     lambda reason: events.IMU_FAILED.event(SensorType.GYRO, 0, reason),
 )
 ACCEL = SensorKind(
-    "ACCEL",
-    "Accel 0",
-    lambda s: tuple(s.accel.tolist()),
-    500_000,
-    400_000,
+    *("ACCEL", "Accel 0", lambda s: tuple(s.accel.tolist()), 500_000, 400_000),
     lambda reason: events.IMU_FAILED.event(SensorType.ACCEL, 0, reason),
 )
 MAG = SensorKind(
@@ -200,7 +190,8 @@ class SensorMonitor:
         `engine.record` defines the bits of sensors with data, and with repeated data.
         """
         self.distrusted = False
-        for bit, watch in ((MAG_BIT, self.mag), (PRESSURE_BIT, self.baro), (GPS_BIT, self.gps)):
+        watched = {fields.MAG: self.mag, fields.PRESSURE: self.baro, fields.GPS: self.gps}
+        for bit, watch in watched.items():
             if measured & bit:
                 watch.repeats = bool(repeated & bit)
                 if watch.repeats:

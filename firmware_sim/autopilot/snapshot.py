@@ -22,14 +22,25 @@ if TYPE_CHECKING:
     from firmware_sim.engine.controller import ControlSetpoints
 
 
-def progress(plans: Plans) -> autopilot_state.MissionProgress:
-    """Return the mission progress and the ids of the stored lists."""
-    mission, fence, rally = (plans.stored(kind) for kind in MissionType)
-    if not (mission.items or fence.items or rally.items):
-        return autopilot_state.NO_MISSION
-    return autopilot_state.MissionProgress(
-        plans.current, len(mission.items), mission.identity, fence.identity, rally.identity
+def progress(plans: Plans, mode: Mode) -> autopilot_state.MissionProgress:
+    """Return the mission progress in the active mode, and the ids of the stored lists."""
+    mission, fence, rally = (plans.stored(kind).identity for kind in MissionType)
+    known = autopilot_state.MissionProgress(
+        plans.current, len(plans.mission), mission, fence, rally
     )
+    if not plans.has_state:
+        return known
+    # As in PX4's MavlinkMissionManager::update_mission_state.
+    active, kind = mode in (Mode.MISSION, Mode.TAKEOFF, Mode.LAND), autopilot_state.MissionState
+    if not plans.valid:
+        state = kind.NO_MISSION
+    elif plans.finished:
+        state = kind.COMPLETE
+    elif active:
+        state = kind.ACTIVE
+    else:
+        state = kind.PAUSED if plans.reached >= 0 or plans.current > 0 else kind.NOT_STARTED
+    return known._replace(state=state, mode=1 if active else 2)
 
 
 def setpoint_of(tick: Any, velocity: Vector) -> autopilot_state.Setpoint:
@@ -179,7 +190,7 @@ _READ: dict[str, Callable[[Any], Any]] = {
     "load": lambda _state: 0.0,
     "armed_us": attrgetter("_autopilot._commander.armed_us"),
     "takeoff_us": attrgetter("_autopilot._commander.takeoff_us"),
-    "mission": lambda state: progress(state._autopilot.plans),
+    "mission": lambda state: progress(state._autopilot.plans, state.status.mode),
     "fence": attrgetter("_autopilot._navigator.fence.status"),
     "orbit": AutopilotState._circle,
     "health": AutopilotState._checked,

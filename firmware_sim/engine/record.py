@@ -107,17 +107,17 @@ AIRCRAFT = np.dtype(
 )
 """Body, rotors, battery and sensors. SI units, NED and FRD, angles in radians."""
 
+_MEASURED: list[Any] = [
+    *((name, _F, 3) for name in ("accel", "gyro", "mag")),
+    *((name, _F) for name in ("pressure_hpa", "temperature_c")),
+    *((name, _F, 3) for name in ("gps_position", "gps_velocity")),  # NED
+]
+
 SAMPLE = np.dtype(
     [
         ("time_us", _I),
         ("measured", _I),
-        ("accel", _F, 3),
-        ("gyro", _F, 3),
-        ("mag", _F, 3),
-        ("pressure_hpa", _F),
-        ("temperature_c", _F),
-        ("gps_position", _F, 3),  # NED [m]
-        ("gps_velocity", _F, 3),
+        *_MEASURED,
         ("gps_epv_m", _F),
         ("battery_left", _F),  # 0..1
     ],
@@ -130,13 +130,7 @@ CONTROLLER = np.dtype(
         # The newest samples.
         ("time_us", _I),
         ("left", _I),  # measurements of the newest tick left to fuse, from `ticks.estimate`
-        ("accel", _F, 3),
-        ("gyro", _F, 3),
-        ("mag", _F, 3),
-        ("pressure_hpa", _F),
-        ("temperature_c", _F),
-        ("gps_position", _F, 3),
-        ("gps_velocity", _F, 3),
+        *_MEASURED,
         ("battery_left", _F),
         ("watch", _I, (WATCHES, 3)),
         ("looked_at", _F, 6),  # accelerometer and gyro at the last failsafe check
@@ -221,13 +215,7 @@ FLOWN_TICK = np.dtype(
         ("time_us", _I),
         ("healthy", _I),
         ("state", _F, error_state.ROW_SIZE),
-        ("accel", _F, 3),
-        ("gyro", _F, 3),
-        ("mag", _F, 3),
-        ("pressure_hpa", _F),
-        ("temperature_c", _F),
-        ("gps_position", _F, 3),
-        ("gps_velocity", _F, 3),
+        *_MEASURED,
         ("demand_kind", _I),
         ("demand", _F, DEMAND_SIZE),
         ("output", _F, OUTPUT_SIZE),

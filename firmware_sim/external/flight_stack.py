@@ -10,7 +10,7 @@ from pathlib import Path
 from airl_mav.core.addons import load
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import LOOPBACK, US_PER_S
-from airl_mav.profiles.loading import stored_release
+from airl_mav.profiles.px4_release import stored_release
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim import interfaces, simulation

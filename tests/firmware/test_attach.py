@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import common
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.core.constants import TICK_US
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_from_euler, quat_yaw
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.vehicle import load_vehicle
@@ -287,3 +287,19 @@ def test_a_wrong_link_is_told(url: str) -> None:
     asked = FirmwareRequest(Aircraft(firmware="attach", real=real), QUAD, None, cast(Any, None))
     with pytest.raises(FieldError, match="accepted: udpin://HOST:PORT"):
         attach_parts(asked)
+
+
+def test_the_link_listens_at_the_given_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like the companion's --connect, it needs no --insecure."""
+    bound: list[Any] = []
+
+    def bind(address: Any, *_rest: Any, insecure: bool) -> UdpEndpoint:
+        bound.append((address, insecure))
+        raise UsageError
+
+    monkeypatch.setattr("firmware_sim.addons.attach.vehicle.UdpEndpoint", bind)
+    real = RealFirmware(connect="udpin://192.0.2.1:14550")
+    asked = FirmwareRequest(Aircraft(firmware="attach", real=real), QUAD, None, cast(Any, None))
+    with pytest.raises(UsageError):
+        attach_parts(asked)
+    assert bound == [(("192.0.2.1", 14550), True)]

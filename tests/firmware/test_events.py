@@ -18,7 +18,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
-from airl_mav.profiles.px4_release import CURRENT
+from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
 from firmware_sim.addons.ground_station_services import component_metadata
 from firmware_sim.addons.ground_station_services.component_metadata import definitions
 from firmware_sim.autopilot.autopilot_state import OperatorText, Result, Severity
@@ -36,13 +36,11 @@ from firmware_sim.autopilot.events.definition import (
     sub_id,
 )
 from firmware_sim.autopilot.events.health_report import ALL_MODES, HealthReport, health_report
-from firmware_sim.autopilot.failsafes.failsafe_conditions import (
-    Conditions,
-)
+from firmware_sim.autopilot.failsafes.failsafe_conditions import BatteryWarning, Conditions
 from firmware_sim.autopilot.failsafes.framework import announcement
 from firmware_sim.autopilot.flight_modes import Mode, Need
 from firmware_sim.autopilot.modes.interface import Source, Sticks
-from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm
+from firmware_sim.autopilot.prearm import ArmingSettings, Readiness, can_arm, failing
 from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.texts_and_events import FIRST_SEQUENCE, KEPT
@@ -100,7 +98,7 @@ def test_an_events_number_is_the_hash_of_its_name() -> None:
 
 
 def test_every_event_has_a_number_of_its_own_and_room_for_its_arguments() -> None:
-    listed = list({definition.name: definition for definition in definitions()}.values())
+    listed = list({definition.name: definition for definition in definitions(CURRENT)}.values())
     assert len({definition.number for definition in listed}) == len(listed) > 50
     for definition in listed:
         event = definition.event(*[0] * len(definition.arguments))
@@ -116,7 +114,7 @@ def test_the_words_on_board_describe_every_event_and_enumeration() -> None:
         for group in component["event_groups"].values()
         for number, event in group["events"].items()
     }
-    assert described == {sub_id(d.name): d.name for d in definitions()}
+    assert described == {sub_id(d.name): d.name for d in definitions(CURRENT)}
     assert component["enums"].keys() == ENUMERATIONS.keys()
     groups = component["navigation_mode_groups"]["groups"]
     assert groups["4"] == [Mode.HOLD.spec.custom_mode] and groups["18"] == [
@@ -128,7 +126,7 @@ def test_the_words_on_board_describe_every_event_and_enumeration() -> None:
 @pytest.mark.parametrize("value", [3e38, -3e38, 1e300, -1e300, math.inf, -math.inf, math.nan])
 def test_an_event_can_be_made_of_any_numbers(value: float) -> None:
     """Out-of-range values are clamped: no event may end a flight."""
-    for definition in definitions():
+    for definition in definitions(CURRENT):
         happened = definition.event(*[value] * len(definition.arguments))
         _, values = read(happened)
         for argument, told in zip(definition.arguments, values, strict=True):
@@ -263,6 +261,78 @@ def test_the_report_agrees_with_what_arming_is_refused_for(mode: Mode) -> None:
         assert (report.can_arm & mode.spec.state_bits == mode.spec.state_bits) is not bool(
             can_arm(here)
         )
+
+
+FAULTY = READY._replace(
+    mode=Mode.OFFBOARD,
+    conditions=Conditions(battery_warning=BatteryWarning.LOW, fd_motor_failure=True),
+    compass_agrees=False,
+    distance=False,
+    failed_motors=0b0100,
+    settings=ArmingSettings(nav_dll_act=1, sys_has_num_dist=1),
+)
+EARLIER = [
+    "Preflight Fail: Motor failure detected",
+    "Preflight Fail: heading estimate not stable",
+    "Preflight Fail: No offboard signal",
+]
+BY_RELEASE: dict[PX4ReleaseName, list[str]] = {
+    "1.16": [
+        *EARLIER,
+        "Preflight Fail: no valid data from distance sensor 0",
+        "Preflight Fail: No connection to the ground control station",
+    ],
+    "1.17": [
+        *EARLIER,
+        "Preflight Fail: No valid distance sensor 0 data",
+        "Preflight Fail: No connection to the GCS",
+    ],
+    "1.18": [
+        "Motor failure: Motor 3 undercurrent detected",
+        "Preflight Fail: heading estimate invalid",
+        "Preflight Fail: No offboard signal",
+        "Preflight Fail: No valid distance sensor 0 data",
+        "Preflight Fail: No connection to the GCS",
+    ],
+}
+
+
+@pytest.mark.parametrize("release", BY_RELEASE)
+def test_checks_are_those_of_the_release(release: PX4ReleaseName) -> None:
+    failed = failing(FAULTY._replace(release=release))
+    others = {text for texts in BY_RELEASE.values() for text in texts}
+    assert sorted(c.text for c in failed if c.text in others) == sorted(BY_RELEASE[release])
+    names = {definition.number: definition.name for definition in definitions(release)}
+    sent = {
+        names[event.number]: event
+        for event in health_report(FAULTY._replace(release=release)).checks
+    }
+    assert ("check_motor_undercurrent" in sent) is (release == "1.18")
+    assert ("check_modes_offboard_signal_lost" in sent) is (release == "1.18")
+    assert ("check_modes_offboard_signal" in sent) is (release != "1.18")
+    urgency = Level.WARNING if release == "1.16" else Level.CRITICAL
+    assert sent["check_battery_low"].levels & 0xF == urgency
+
+
+@pytest.mark.parametrize(("release", "armable"), [("1.16", False), ("1.17", False), ("1.18", True)])
+def test_modes_without_a_position_arm_with_an_unstable_heading(
+    release: PX4ReleaseName, armable: bool
+) -> None:
+    pilot = Conditions(manual_control_signal_lost=False)
+    faulty = READY._replace(compass_agrees=False, conditions=pilot, release=release)
+    report = health_report(faulty)
+    assert bool(report.can_arm & ModeGroup.STAB) is armable
+    assert report.can_arm & ModeGroup.ACRO and not report.can_arm & ModeGroup.POSCTL
+
+
+@pytest.mark.parametrize("lacks", ["position", "velocity"])
+def test_offboard_names_the_missing_estimate_since_1_18(lacks: str) -> None:
+    def offboard(release: PX4ReleaseName) -> list[str]:
+        checks = failing(READY._replace(mode=Mode.OFFBOARD, offboard_lacks=lacks, release=release))
+        return [each.event.name for each in checks if "offboard" in each.event.name]
+
+    assert offboard("1.17") == ["check_modes_offboard_signal"]
+    assert offboard("1.18") == [f"check_modes_offboard_no_local_{lacks}"]
 
 
 def test_a_vehicle_tells_what_has_changed_and_no_more() -> None:

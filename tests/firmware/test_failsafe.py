@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from airl_mav.control.demand import AttitudeDemand
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.px4_release import PX4ReleaseName
 from airl_mav.profiles.vehicle import load_vehicle
@@ -341,6 +342,28 @@ def test_kill_in_the_air_cuts_the_motors() -> None:
         assert rig.ap.flight.phase is FlightPhase.STANDBY
 
 
+def test_a_landing_in_offboard_attitude_disarms() -> None:
+    """As in PX4, COM_DISARM_LAND counts although the motors idle."""
+    with flight(SEED) as rig:
+        rig.take_off(2.0)
+
+        def hold(thrust: float, seconds: float) -> None:
+            for _ in range(round(seconds / 0.05)):
+                level = AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.0, thrust)
+                rig.ap.offer_attitude(level, rig.sim.time_us)
+                rig.run(0.05)
+
+        hold(0.5, 0.1)
+        assert rig.ap.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+        hold(0.0, 3.0)
+        assert rig.ap.flight.phase is FlightPhase.GROUND
+        hold(0.4, 3.0)  # too much thrust for a vehicle that has landed
+        assert rig.ap.flight.phase is FlightPhase.GROUND
+        hold(0.0, 2.2)
+        assert int(rig.ap.flight.phase) < FlightPhase.GROUND
+        assert rig.said("Disarmed by landing") > rig.said("Landing detected") + 5.0
+
+
 # --- battery
 
 LOW, CRITICAL, EMERGENCY = "Low battery", "Critical battery", "Emergency battery level"
@@ -365,12 +388,16 @@ class Drain:
 
 
 @pytest.mark.parametrize(
-    ("release", "warned"), [("1.16", [(Severity.CRITICAL, "Failsafe activated")]), ("1.17", [])]
+    ("release", "severity", "warned"),
+    [
+        ("1.16", Severity.EMERGENCY, [(Severity.CRITICAL, "Failsafe activated")]),
+        ("1.17", Severity.CRITICAL, []),
+    ],
 )
 def test_battery_levels_are_said_once_each(
-    release: PX4ReleaseName, warned: list[tuple[Severity, str]]
+    release: PX4ReleaseName, severity: Severity, warned: list[tuple[Severity, str]]
 ) -> None:
-    """From PX4 1.17 on, a warning of the failsafes is an event alone."""
+    """From PX4 1.17 on, a warning is an event alone, and only an empty battery an emergency."""
     vehicle = load_vehicle("quad", release)
     with flight(SEED, vehicle=vehicle, parameters={"COM_LOW_BAT_ACT": 0}) as rig:
         drain = Drain(rig)
@@ -383,9 +410,9 @@ def test_battery_levels_are_said_once_each(
 
         drain.remaining, drain.per_s = 0.16, 0.008
         rig.run(16.0, note)
-        assert [(severity, text) for severity, text, _ in said] == [
-            *[(Severity.EMERGENCY, LOW), *warned],
-            *[(Severity.EMERGENCY, CRITICAL), *warned],
+        assert [(each, text) for each, text, _ in said] == [
+            *[(severity, LOW), *warned],
+            *[(severity, CRITICAL), *warned],
             *[(Severity.EMERGENCY, EMERGENCY), *warned],
         ]
         levels = [level for level in (0.15, 0.07, 0.05) for _ in range(1 + len(warned))]

@@ -77,7 +77,7 @@ def test_ground_station_lost_returns_home() -> None:
     with flight(SEED, parameters=parameters) as rig:
         rig.boot()
         assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
-        assert said(rig, "Preflight Fail: No connection to the ground control station") > 0
+        assert said(rig, "Preflight Fail: No connection to the GCS") > 0
         rig.ap.gcs_heartbeat(rig.sim.time_us)
         out(rig)
         rig.until(lambda: said(rig, "Connection to ground station lost") > 0, 31.0)
@@ -98,7 +98,7 @@ def test_fence_breach_holds_and_lets_the_pilot_out() -> None:
         rig.ap.parameters.set("GF_MAX_HOR_DIST", 4.0)
         rig.run(0.5)
         assert (rig.mode, rig.ap.flight.failsafe) == (Mode.HOLD, True)
-        assert said(rig, "Geofence violation: exceeding maximum distance to Home") == 1
+        assert said(rig, "Geofence: exceeding maximum distance to Home") == 1
         rig.stream(NORTHWARD)
         rig.tick()
         assert rig.ap.set_mode(Mode.OFFBOARD) is Result.ACCEPTED

@@ -471,7 +471,7 @@ def test_calendar_time() -> None:
 
 def test_mission_is_empty() -> None:
     message = newest(flown(), "MISSION_CURRENT")
-    assert (message.seq, message.total, message.mission_state) == (0, 65_535, 0)
+    assert (message.seq, message.total, message.mission_state) == (0, 65_535, 1)
 
 
 # --- modes, measured on a real PX4

@@ -44,7 +44,7 @@ def test_what_is_flown_to_is_always_a_place() -> None:
         landed = rng.random() < 0.5
         flight.now = flight.now._replace(position=(0.0, 0.0, -10.0), landed=landed)
         flight.start()
-        ran += flight.executor.valid
+        ran += flight.plans.valid
         for _ in range(10):
             if rng.random() < 0.5:
                 flight.arrive(landed=rng.random() < 0.2)

@@ -8,7 +8,9 @@ import pytest
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.addons.missions.items import NavCommand, PlanFrame, TripletKind
+from firmware_sim.autopilot.flight_modes import Mode
 from firmware_sim.autopilot.navigation.plan import MissionType, PlanItem
+from firmware_sim.autopilot.snapshot import progress
 from tests.support.mission_kit import NAN, ORIGIN, FakeFlight, at, do, place
 
 N = NavCommand
@@ -100,7 +102,7 @@ def test_the_triplet_has_what_was_and_what_comes() -> None:
 def test_the_end_is_hold() -> None:
     flight = flying(at(20, 0, 10))
     flight.arrive()
-    assert flight.executor.finished
+    assert flight.plans.finished
     assert flight.texts[-1] == "Mission finished, loitering"
     assert kind(flight) is TripletKind.LOITER
 
@@ -124,7 +126,7 @@ def test_jumps_are_counted_and_counted_anew_after_the_end() -> None:
         order.append(flight.plans.current)
         flight.arrive()
     assert order == [0, 1, 0, 1, 0, 1, 3]
-    assert flight.executor.finished
+    assert flight.plans.finished
     assert flight.plans.jumps_done == {}
     # Interrupted, the count stays.
     flight = flying(at(20, 0, 10), do(N.DO_JUMP, 0, 5), at(0, 0, 10))
@@ -139,7 +141,7 @@ def test_jumps_are_counted_and_counted_anew_after_the_end() -> None:
 def test_a_jump_out_of_the_mission_ends_it(target_index: float) -> None:
     flight = flying(at(20, 0, 10), do(N.DO_JUMP, target_index, 1))
     flight.arrive()
-    assert flight.executor.finished
+    assert flight.plans.finished
 
 
 def test_jumps_in_a_circle_end() -> None:
@@ -153,11 +155,12 @@ def test_pause_and_resume_go_on_with_the_item() -> None:
     flight.arrive()
     flight.be()
     assert flight.plans.current == 2
+    reached = flight.plans.reached
     flight.executor.deactivate()
-    assert flight.plans.reached == -1
+    assert flight.plans.reached == reached >= 0
     flight.executor.idle(flight.now, armed=True)
     flight.start()
-    assert flight.plans.current == 2
+    assert (flight.plans.current, flight.plans.reached) == (2, -1)
     assert target(flight) == (40.0, 0.0, -10.0)
     # The speed of before comes back with the next item, as in PX4.
     assert math.isnan(flight.executor.triplet.cruise_m_s)
@@ -179,6 +182,46 @@ def test_flown_to_its_end_it_begins_anew_once_disarmed() -> None:
     assert flight.plans.current == 0
 
 
+@pytest.mark.parametrize("has_state", [False, True])
+def test_a_return_ends_the_mission(has_state: bool) -> None:
+    """Up to PX4 1.16 clients read the end of the mission from the item before the return."""
+    flight = flying(at(20, 0, 10), at(40, 0, 10), do(N.RETURN_TO_LAUNCH))
+    flight.plans.has_state = has_state
+    flight.arrive()
+    flight.arrive()
+    assert flight.plans.current == 2 and flight.plans.finished is has_state
+    assert ("Mission finished, loitering" in flight.texts) is has_state
+    flight.executor.deactivate()
+    flight.executor.idle(flight.now, armed=False)
+    assert flight.plans.reached == (2 if has_state else 1)
+    state = progress(flight.plans, Mode.RETURN).state.name
+    assert state == ("COMPLETE" if has_state else "UNKNOWN")
+
+
+def test_the_state_of_the_mission_is_reported() -> None:
+    def state(mode: Mode) -> tuple[str, int]:
+        found = progress(flight.plans, mode)
+        return found.state.name, found.mode
+
+    flight = FakeFlight(at(20, 0, 10), at(40, 0, 10))
+    assert state(Mode.HOLD) == ("NO_MISSION", 2)  # not yet checked
+    flight.executor.idle(flight.now, armed=False)
+    assert state(Mode.HOLD) == ("NOT_STARTED", 2)
+    flight.now = flight.now._replace(position=(0.0, 0.0, -10.0), landed=False)
+    flight.start()
+    assert state(Mode.MISSION) == ("ACTIVE", 1)
+    flight.arrive()
+    assert state(Mode.RETURN) == ("PAUSED", 2)
+    flight.arrive()
+    assert state(Mode.MISSION) == ("COMPLETE", 1)
+    flight.executor.deactivate()
+    assert state(Mode.HOLD) == ("COMPLETE", 2)
+    flight.start()
+    flight.plans.clear(MissionType.MISSION)
+    flight.executor.idle(flight.now, armed=True)
+    assert state(Mode.HOLD) == ("NO_MISSION", 2)
+
+
 def test_set_current_and_a_new_mission_are_flown_at_once() -> None:
     flight = flying(at(20, 0, 10), at(40, 0, 10), at(60, 0, 10))
     flight.plans.set_current(2)
@@ -191,7 +234,7 @@ def test_set_current_and_a_new_mission_are_flown_at_once() -> None:
     flight.plans.clear(MissionType.MISSION)
     flight.be()
     assert flight.texts[-1] == "No valid mission available, loitering"
-    assert flight.executor.finished
+    assert flight.plans.finished
 
 
 def test_without_a_mission_it_does_not_take_off() -> None:

@@ -476,6 +476,6 @@ def test_arming_waits_for_a_sensor_that_is_asked_for() -> None:
     present, enabled, healthy = status.sensor_bits(rig.ap.state())
     assert present & bit and enabled & bit and not healthy & bit
     assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
-    assert not math.isnan(rig.said("Preflight Fail: no valid data from distance sensor 0"))
+    assert not math.isnan(rig.said("Preflight Fail: No valid distance sensor 0 data"))
     rig.run(0.5, lambda: rig.ap.receive("distance", reading))
     assert rig.ap.arm(force=False) is Result.ACCEPTED

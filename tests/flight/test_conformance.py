@@ -51,12 +51,8 @@ from airl_mav.addons.conformance.vehicle import Method, VehicleClock
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
-from airl_mav.profiles.loading import (
-    list_profiles,
-    load_profile,
-    stored_release,
-    version_name,
-)
+from airl_mav.profiles.loading import list_profiles, load_profile
+from airl_mav.profiles.px4_release import stored_release, version_name
 from companion.link_interface import LinkError
 
 RATE_HZ = 1000.0

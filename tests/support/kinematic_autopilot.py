@@ -385,7 +385,7 @@ class KinematicAutopilot(BuiltinAutopilot):
             home=self.home,
             origin=self.origin,
             load=0.123,
-            mission=progress(self.plans),
+            mission=progress(self.plans, self.mode),
             home_yaw=0.6,
             destination=self.destination,
         )

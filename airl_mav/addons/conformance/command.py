@@ -35,7 +35,7 @@ from airl_mav.addons.conformance.result import (
 from airl_mav.addons.conformance.vehicle import SetpointStream, VehicleConnection
 from airl_mav.core import child_process, clock, constants, errors, fields
 from airl_mav.core.progress import new_console
-from airl_mav.profiles import loading
+from airl_mav.profiles import loading, px4_release
 from companion.link_interface import LinkError
 
 
@@ -141,7 +141,7 @@ def _check(vehicle: VehicleConnection, checklist: Checklist, result: Conformance
     checklist.perform("version", lambda: version(vehicle))
     fields = vehicle.telemetry.latest("AUTOPILOT_VERSION") or {"flight_sw_version": 0}
     title, number = vehicle.autopilot.title, fields["flight_sw_version"]
-    column, result.firmware = loading.stored_release(title, number)
+    column, result.firmware = px4_release.stored_release(title, number)
     vehicle.transcript.add("note", result.firmware)
     vehicle.autopilot = RELEASES.get(column, vehicle.autopilot)
     column = column if settings.reference == AUTO else settings.reference

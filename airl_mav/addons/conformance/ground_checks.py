@@ -10,7 +10,7 @@ from airl_mav.addons.conformance.telemetry import Fields
 from airl_mav.addons.conformance.vehicle import Method, VehicleConnection
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.profiles.loading import version_name
+from airl_mav.profiles.px4_release import version_name
 
 FIRST_MESSAGE_S = 5.0  # Timeout of a message that every vehicle sends [wall s]
 COUNT_S = 5.0  # Duration of message counting [s]

@@ -358,15 +358,16 @@ def attach_parts(
     request: flight_stack.FirmwareRequest,
 ) -> tuple[Launcher, observer.FirmwareObserver]:
     """Bind the link to the vehicle. Return a launcher that starts nothing, and the observer."""
-    url, option = request.aircraft.real.connect or "", "--connect"
-    endpoint = UdpEndpoint(address_of(request.aircraft.real), None, option, option)
+    real, option = request.aircraft.real, "--connect"
+    # Listens at any given address, like the companion's --connect.
+    endpoint = UdpEndpoint(address_of(real), None, option, option, insecure=True)
     vehicle = VehicleTelemetry(endpoint, "observer", request.vehicle.told_origin)
     half_height_m = 0.5 * request.vehicle.body.height_m
 
     launcher = Launcher(
         _AIRFRAME,
-        lambda: AttachedBridge(vehicle, url, half_height_m),
-        request.aircraft.real.firmware_timeout,
+        lambda: AttachedBridge(vehicle, real.connect or "", half_height_m),
+        real.firmware_timeout,
         farewell=None,
     )
     launcher.body_by, launcher.local = partial(AttachedBody, vehicle), vehicle.local

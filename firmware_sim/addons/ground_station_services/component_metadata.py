@@ -46,7 +46,7 @@ def files(release: PX4ReleaseName) -> dict[str, bytes]:
     # The general file contains the checksums of the others, so it comes last.
     listed = [_parameter_described(spec) for spec in px4_release(release).specs]
     parameters = _compressed({"version": 1, "parameters": listed})
-    events = _compressed(_event_document())
+    events = _compressed(_event_document(release))
     entries = [
         {"type": kind, "uri": f"mftp://{_FOLDER}/{name}", "fileCrc": crc32part(data)}
         for kind, name, data in (
@@ -146,8 +146,8 @@ def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
 # --- event texts (https://github.com/mavlink/libevents, `validation/schema.json`)
 
 
-def definitions() -> Iterator[Definition]:
-    """Yield all events that this vehicle can send."""
+def all_definitions() -> Iterator[Definition]:
+    """Yield the events of all releases that this vehicle can send."""
     added = map(load, entries("firmware_sim", "EVENTS").values())
     for module in (flight_events, health_report, *added):
         for value in vars(module).values():
@@ -157,11 +157,19 @@ def definitions() -> Iterator[Definition]:
         yield check.event
 
 
-def _event_document() -> dict[str, Any]:
+def definitions(release: PX4ReleaseName) -> Iterator[Definition]:
+    """Yield the events that this vehicle can send as a PX4 release."""
+    found = px4_release(release)
+    for event in all_definitions():
+        if event.name not in found.unknown_events:
+            yield event.of_release(found.events.get(event.name, {}))
+
+
+def _event_document(release: PX4ReleaseName) -> dict[str, Any]:
     """Return the content of the file with the event texts."""
     groups: dict[str, dict[str, Any]] = {}
     # Event keys are the sub ids within the component's namespace.
-    for definition in definitions():
+    for definition in definitions(release):
         group = groups.setdefault(definition.group, {"events": {}})
         group["events"][str(sub_id(definition.name))] = _event_described(definition)
     component = {
@@ -192,7 +200,7 @@ def _enumeration(listed: Enumeration) -> dict[str, Any]:
     if listed.bitfield:
         described["is_bitfield"] = True
     described["entries"] = {
-        str(member.value): {"name": member.name.lower(), "description": words(member)}
+        str(member.value): {"name": (member.name or "").lower(), "description": words(member)}
         for member in listed.members
     }
     return described

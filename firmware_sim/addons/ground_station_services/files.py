@@ -83,19 +83,12 @@ SESSION = 0
 """Number of a client's only session, as in PX4."""
 
 
-class Code(IntEnum):
-    """Error codes in the first byte of a NAK."""
-
-    FAIL = 1
-    FAIL_ERRNO = 2
-    INVALID_DATA_SIZE = 3
-    INVALID_SESSION = 4
-    NO_SESSIONS = 5
-    END_OF_FILE = 6
-    UNKNOWN_COMMAND = 7
-    FILE_EXISTS = 8
-    FILE_PROTECTED = 9
-    FILE_NOT_FOUND = 10
+Code = IntEnum(
+    "Code",
+    "FAIL FAIL_ERRNO INVALID_DATA_SIZE INVALID_SESSION NO_SESSIONS END_OF_FILE UNKNOWN_COMMAND "
+    "FILE_EXISTS FILE_PROTECTED FILE_NOT_FOUND",
+)
+"""Error codes in the first byte of a NAK."""
 
 
 class RefusedError(Exception):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from enum import Enum, auto
+from functools import partial
 
 from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
@@ -76,18 +77,11 @@ _LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
 MISSION_EXECUTE = define("mission_execute", "Executing Mission")
 MISSION_FINISHED = define("mission_finished", "Mission finished, landed")
 MISSION_FINISHED_LOITER = define("mission_finished_loiter", "Mission finished, loitering")
-MISSION_REFUSED = define(
-    "mission_not_valid_refuse",
-    "No valid mission available, refusing takeoff",
-    level=Level.ERROR,
-    internal=Level.DISABLED,
+_invalid = partial(define, level=Level.ERROR, internal=Level.DISABLED)
+MISSION_REFUSED = _invalid(
+    "mission_not_valid_refuse", "No valid mission available, refusing takeoff"
 )
-MISSION_LOITER = define(
-    "mission_not_valid_loiter",
-    "No valid mission available, loitering",
-    level=Level.ERROR,
-    internal=Level.DISABLED,
-)
+MISSION_LOITER = _invalid("mission_not_valid_loiter", "No valid mission available, loitering")
 MISSION_CLIMB = define(
     "mission_climb_before_start", "Climb to {1:.1m_v} above home", "float mission_init_climb_alt"
 )
@@ -122,15 +116,10 @@ class MissionExecutor:
         self._plans, self._value, self._crew, self._check = plans, value, crew, check
         self.triplet = items.STANDING
         """Current path."""
-        self.valid = False
-        """True if there is a feasible mission."""
-        self.finished = False
-        """True if the mission has ended in this run."""
         self.cruise_m_s = NAN
         """Speed set by DO_CHANGE_SPEED; NaN = MPC_XY_CRUISE."""
         self.roi = VehicleRoi()
         self._running = False
-        self._active = False
         self._work = _Work.ITEM
         self._flown = items.FlownItem(_N.WAYPOINT, (0.0, 0.0, 0.0))
         self._arrival = items.Arrival(value)
@@ -167,7 +156,7 @@ class MissionExecutor:
             plans.jumps_done.clear()
         self._began_before, self._disarmed_meanwhile = True, False
         self.cruise_m_s = NAN
-        self._active, self.triplet = True, items.STANDING
+        self.triplet = items.STANDING
         self._begin(situation.landed)
         self._speed_to_restore = self._speed_before(plans.current)
         self._climb_first(situation)
@@ -176,9 +165,8 @@ class MissionExecutor:
 
     def deactivate(self) -> None:
         """Leave Mission mode; the current item restarts when the mission resumes."""
-        self._active = self._running = False
+        self._running = False
         self._work = _Work.ITEM
-        self._plans.reached = -1
 
     def update(self, situation: plan.NavigationState) -> None:
         """Advance the mission; call at 20 Hz in Mission mode."""
@@ -227,13 +215,13 @@ class MissionExecutor:
         verdict = self._check(situation)
         for message in verdict.messages:
             self._crew.say(message)
-        self.valid = verdict.valid
+        self._plans.valid = verdict.valid
 
     def _begin(self, landed: bool) -> None:
         """Start, or report the reason against it."""
         self.roi.look_at(None)
-        self.finished = False
-        if not self.valid:
+        self._plans.finished = False
+        if not self._plans.valid:
             self._running = False
             refused = MISSION_REFUSED if landed else MISSION_LOITER
             self._announce(Severity.CRITICAL, refused.message, refused.event())
@@ -280,7 +268,7 @@ class MissionExecutor:
     def _end(self, situation: plan.NavigationState) -> None:
         """Hold position at the end of the mission."""
         self._running = False
-        self.finished = True
+        self._plans.finished = True
         triplet = self.triplet
         if situation.landed:
             self.triplet = items.Triplet(items.TripletKind.IDLE, situation.position)
@@ -414,6 +402,10 @@ class MissionExecutor:
         if command == _N.DO_CHANGE_SPEED:
             self.cruise_m_s = params[1] if params[1] > 0.0 else NAN
         elif command == _N.RETURN_TO_LAUNCH:
+            # As in PX4, the mission ends before the commander changes the mode.
+            if self._plans.has_state and self._plans.current + 1 == len(self._plans.mission):
+                self._plans.reached = self._plans.current
+                self._advance(situation)
             self._crew.return_to_launch()
         elif command == _N.DO_SET_HOME:
             here = params[0] > 0.5

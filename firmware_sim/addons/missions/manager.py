@@ -248,12 +248,12 @@ class MissionManager(plan.Missions):
     @property
     def valid(self) -> bool:
         """True if a feasible mission is stored."""
-        return self.executor.valid
+        return self._plans.valid
 
     @property
     def over(self) -> bool:
         """True if the active mission has ended."""
-        return self._flying and self.executor.finished
+        return self._flying and self._plans.finished
 
     def review(self, now: plan.NavigationState, /) -> None:
         """Check the mission after a change of mission, fence or home."""

@@ -388,7 +388,8 @@ def _check_timeouts(context: services.Context) -> None:
     transfer, now_us = context.state(MissionTransfer), context.now_us
     # PX4's timeout applies to uploads and downloads.
     if now_us - transfer.received_us > TIMEOUT_US:
-        _report(context, "Operation timeout", TIMED_OUT)
+        change = context.port.parameters.release.events.get(TIMED_OUT.name, {})
+        _report(context, change.get("text", "Operation timeout"), TIMED_OUT.of_release(change))
         _end_upload(context)
     elif transfer.activity is _RECEIVING and now_us - transfer.sent_us > RETRY_US:
         _request(context)
@@ -427,11 +428,8 @@ def _request(context: services.Context) -> None:
 
 
 def _send_item(context: services.Context, index: int) -> None:
-    transfer, kind = (
-        context.state(MissionTransfer),
-        MissionType(context.state(MissionTransfer).kind),
-    )
-    plans = context.port.plans
+    transfer, plans = context.state(MissionTransfer), context.port.plans
+    kind = MissionType(transfer.kind)
     transfer.sent_us = context.now_us
     context.link.send(
         items.format_item(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from functools import partial
 from typing import NamedTuple
 
@@ -34,46 +34,15 @@ class ModeGroup(IntEnum):
     VTOL_TAKEOFF = 1 << 22
 
 
-class Component(IntEnum):
-    """Components of the vehicle; the argument of a check is the bit index."""
-
-    NONE = 1 << 0
-    ABSOLUTE_PRESSURE = 1 << 1
-    DIFFERENTIAL_PRESSURE = 1 << 2
-    GPS = 1 << 3
-    OPTICAL_FLOW = 1 << 4
-    VISION_POSITION = 1 << 5
-    DISTANCE_SENSOR = 1 << 6
-    REMOTE_CONTROL = 1 << 7
-    MOTORS_ESCS = 1 << 8
-    UTM = 1 << 9
-    LOGGING = 1 << 10
-    BATTERY = 1 << 11
-    COMMUNICATION_LINKS = 1 << 12
-    RATE_CONTROLLER = 1 << 13
-    ATTITUDE_CONTROLLER = 1 << 14
-    POSITION_CONTROLLER = 1 << 15
-    ATTITUDE_ESTIMATE = 1 << 16
-    LOCAL_POSITION_ESTIMATE = 1 << 17
-    MISSION = 1 << 18
-    AVOIDANCE = 1 << 19
-    SYSTEM = 1 << 20
-    CAMERA = 1 << 21
-    GIMBAL = 1 << 22
-    PAYLOAD = 1 << 23
-    GLOBAL_POSITION_ESTIMATE = 1 << 24
-    STORAGE = 1 << 25
-    PARACHUTE = 1 << 26
-    MAGNETOMETER = 1 << 27
-    ACCEL = 1 << 28
-    GYRO = 1 << 29
-    OPEN_DRONE_ID = 1 << 30
-
-    @property
-    def place(self) -> int:
-        """Bit index of the component."""
-        return self.value.bit_length() - 1
-
+Component = IntFlag(
+    "Component",
+    "NONE ABSOLUTE_PRESSURE DIFFERENTIAL_PRESSURE GPS OPTICAL_FLOW VISION_POSITION "
+    "DISTANCE_SENSOR REMOTE_CONTROL MOTORS_ESCS UTM LOGGING BATTERY COMMUNICATION_LINKS "
+    "RATE_CONTROLLER ATTITUDE_CONTROLLER POSITION_CONTROLLER ATTITUDE_ESTIMATE "
+    "LOCAL_POSITION_ESTIMATE MISSION AVOIDANCE SYSTEM CAMERA GIMBAL PAYLOAD "
+    "GLOBAL_POSITION_ESTIMATE STORAGE PARACHUTE MAGNETOMETER ACCEL GYRO OPEN_DRONE_ID",
+)
+"""Components of the vehicle; the argument of a check is the index of the bit."""
 
 ArmingReason = IntEnum(
     "ArmingReason",
@@ -138,14 +107,10 @@ SensorType = IntEnum("SensorType", "ACCEL GYRO MAG", start=0)
 """Inertial sensors in texts."""
 
 
-class SensorFailure(IntEnum):
-    """Reasons of a sensor failure, as bits."""
-
-    NO_DATA = 1
-    STALE_DATA = 2
-    TIMEOUT = 4
-    HIGH_ERROR_COUNT = 8
-    HIGH_ERROR_DENSITY = 16
+SensorFailure = IntFlag(
+    "SensorFailure", "NO_DATA STALE_DATA TIMEOUT HIGH_ERROR_COUNT HIGH_ERROR_DENSITY"
+)
+"""Reasons of a sensor failure, as bits."""
 
 
 FailsafeCause = IntEnum(
@@ -162,7 +127,7 @@ class Enumeration(NamedTuple):
 
     base: str
     """Type on the wire."""
-    members: type[IntEnum]
+    members: type[IntEnum] | type[IntFlag]
     meaning: str
     bitfield: bool = False
 
@@ -220,9 +185,10 @@ _WORDS: Mapping[str, str] = {
 """Texts that differ from the member's name."""
 
 
-def words(member: IntEnum) -> str:
+def words(member: IntEnum | IntFlag) -> str:
     """Return the operator text of an enumeration member."""
-    return _WORDS.get(member.name, member.name.replace("_", " ").capitalize())
+    name = member.name or ""
+    return _WORDS.get(name, name.replace("_", " ").capitalize())
 
 
 _AUTOPILOT = 1
@@ -246,19 +212,12 @@ FORMATS = {
 """Argument types and their `struct` formats."""
 
 
-class Level(IntEnum):
-    """Severity of an event. PROTOCOL events are for internal use of ground stations."""
-
-    EMERGENCY = 0
-    ALERT = 1
-    CRITICAL = 2
-    ERROR = 3
-    WARNING = 4
-    NOTICE = 5
-    INFO = 6
-    DEBUG = 7
-    PROTOCOL = 8
-    DISABLED = 9
+Level = IntEnum(
+    "Level",
+    "EMERGENCY ALERT CRITICAL ERROR WARNING NOTICE INFO DEBUG PROTOCOL DISABLED",
+    start=0,
+)
+"""Severity of an event, to DEBUG as in MAV_SEVERITY. PROTOCOL: internal use of ground stations."""
 
 
 class Argument(NamedTuple):
@@ -298,6 +257,12 @@ class Definition(NamedTuple):
     def number(self) -> int:
         """MAVLink id of the event."""
         return _AUTOPILOT << 24 | sub_id(self.name)
+
+    def of_release(self, change: Mapping[str, str]) -> Definition:
+        """Return the definition of a PX4 release, with its changed name, message or level."""
+        name, message = (change.get(key, getattr(self, key)) for key in ("name", "message"))
+        level = Level[change["level"]] if "level" in change else self.level
+        return self._replace(name=name, message=message, level=level)
 
     def event(self, *values: float, level: Level | None = None) -> MavlinkEvent:
         """Return an event of this type; `level` overrides its levels.

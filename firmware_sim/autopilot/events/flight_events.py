@@ -86,14 +86,14 @@ RTL_LAND = define("rtl_land_at_destination", "RTL: land at destination")
 RTL_LOITERING = define("rtl_completed_loiter", "RTL: completed, loitering")
 
 # The failsafe event depends on a delay in Hold and on a specific cause.
-_failsafe = partial(define, level=Level.CRITICAL, internal=Level.WARNING)
-FAILSAFE_HOLD_GENERIC = _failsafe(
+_alarm = partial(define, level=Level.CRITICAL, internal=Level.WARNING)
+FAILSAFE_HOLD_GENERIC = _alarm(
     "commander_failsafe_enter_generic_hold",
     "Failsafe activated: switching to {2} in {3} seconds",
     "uint32_t mavlink_mode, failsafe_action_t action, uint16_t delay_s",
     kind=_APPENDED,
 )
-FAILSAFE_HOLD = _failsafe(
+FAILSAFE_HOLD = _alarm(
     "commander_failsafe_enter_hold",
     "{4}: switching to {2} in {3} seconds",
     "uint32_t mavlink_mode, failsafe_action_t action, uint16_t delay_s, failsafe_cause_t cause",
@@ -106,14 +106,14 @@ FAILSAFE_WARN_GENERIC = define(
     description="No action is triggered.",
     kind=_APPENDED,
 )
-FAILSAFE_DISENGAGED = _failsafe(
+FAILSAFE_DISENGAGED = _alarm(
     "commander_failsafe_enter_autopilot_disengaged",
     "Failsafe activated: Autopilot disengaged, switching to {2}",
     "uint32_t mavlink_mode, failsafe_action_t action",
     description="The vehicle no longer holds its position.",
     kind=_APPENDED,
 )
-FAILSAFE_GENERIC = _failsafe(
+FAILSAFE_GENERIC = _alarm(
     "commander_failsafe_enter_generic",
     "Failsafe activated: switching to {2}",
     "uint32_t mavlink_mode, failsafe_action_t action",
@@ -141,26 +141,18 @@ FAILSAFE_WARN = define(
     level=Level.WARNING,
     description="No action is triggered.",
 )
-FAILSAFE = _failsafe(
+FAILSAFE = _alarm(
     "commander_failsafe_enter",
     "{3}: switching to {2}",
     "uint32_t mavlink_mode, failsafe_action_t action, failsafe_cause_t cause",
 )
-
-
-FENCE_WITHOUT_HOME = define(
-    "navigator_geofence_invalid_against_home",
-    "Geofence invalid, doesn't contain Home position",
-    level=Level.CRITICAL,
-    internal=Level.WARNING,
+FENCE_WITHOUT_HOME = _alarm(
+    "navigator_geofence_invalid_against_home", "Geofence invalid, doesn't contain Home position"
 )
-FENCE_WITHOUT_VEHICLE = define(
+FENCE_WITHOUT_VEHICLE = _alarm(
     "navigator_geofence_invalid_against_cur_pos",
     "Geofence invalid, doesn't contain current vehicle position",
-    level=Level.CRITICAL,
-    internal=Level.WARNING,
 )
-
 
 ARM_PARAMETER = wrong(
     "commander_unsupported_arm_disarm_param", "Unsupported ARM_DISARM param: {1:.3}", "float param1"

@@ -14,7 +14,7 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.events import definition
 from firmware_sim.autopilot.failsafes.failsafe_conditions import lacking
 from firmware_sim.autopilot.flight_modes import Mode, Need
-from firmware_sim.autopilot.prearm import CHECKS, SUPPLY_CHECK_OFF, PrearmCheck, Readiness
+from firmware_sim.autopilot.prearm import SUPPLY_CHECK_OFF, PrearmCheck, Readiness, checks
 
 ALL_MODES = 0xFFFFFFFF
 
@@ -91,7 +91,7 @@ def health_report(readiness: Readiness) -> HealthReport:
     in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}
     findings: list[definition.MavlinkEvent] = []
     blocked = arming_error = arming_warning = health_error = health_warning = 0
-    for check in CHECKS:
+    for check in checks(readiness.release):
         modes = _blocked_modes(check, readiness, in_modes)
         if modes is None:
             continue
@@ -106,7 +106,7 @@ def health_report(readiness: Readiness) -> HealthReport:
             arming_error |= bit * error
             arming_warning |= bit * warning
         shown = modes if check.shown is None else modes | _modes_needing(check.shown(readiness))
-        values = (shown or ALL_MODES, check.component.place, *check.values)
+        values = (shown or ALL_MODES, check.component.bit_length() - 1, *check.values)
         findings.append(check.event.event(*values, level=level))
     return HealthReport(
         ALL_MODES & ~EXTERNAL_MODES & ~blocked,

@@ -43,8 +43,8 @@ class MotorFailure:
 
     def __init__(self) -> None:
         """Start with all motors healthy."""
-        self.failed = False
-        """True if a motor has failed."""
+        self.failed = 0
+        """Bits of the failed motors."""
         self._since_us: dict[int, int] = {}
 
     def take(
@@ -71,11 +71,11 @@ class MotorFailure:
             elif time_us - self._since_us.setdefault(motor, time_us) > (
                 limits.lasting_ms * US_PER_MS
             ):
-                self.failed = True
+                self.failed |= 1 << motor
 
     def rest(self) -> None:
         """Reset the detector: the vehicle is disarmed."""
-        self.failed = False
+        self.failed = 0
         self._since_us.clear()
 
 

@@ -51,13 +51,8 @@ FLIGHT_TERMINATION_OFF = 121212
 """Value of CBRK_FLIGHTTERM that disables flight termination by the failure detector."""
 
 
-class BatteryWarning(IntEnum):
-    """Battery warning level."""
-
-    NONE = 0
-    LOW = 1
-    CRITICAL = 2
-    EMERGENCY = 3
+BatteryWarning = IntEnum("BatteryWarning", "NONE LOW CRITICAL EMERGENCY", start=0)
+"""Battery warning level."""
 
 
 class FenceBreach(NamedTuple):

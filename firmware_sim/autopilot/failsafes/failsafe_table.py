@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
@@ -108,22 +108,12 @@ class Situation(NamedTuple):
     rules: FailsafeRules = px4_release().failsafes
 
 
-class Trigger(Enum):
-    """Cause of a failsafe; one action is held per trigger."""
-
-    MANUAL_CONTROL = auto()
-    GCS = auto()
-    MISSION_WITHOUT_LINKS = auto()
-    FLIGHT_TIME = auto()
-    POSITION_ACCURACY = auto()
-    GEOFENCE = auto()
-    REMAINING_TIME = auto()
-    BATTERY_LOW = auto()
-    BATTERY_CRITICAL = auto()
-    BATTERY_EMERGENCY = auto()
-    ATTITUDE = auto()
-    MOTOR = auto()
-    MODE_FALLBACK = auto()
+Trigger = Enum(
+    "Trigger",
+    "MANUAL_CONTROL GCS MISSION_WITHOUT_LINKS FLIGHT_TIME POSITION_ACCURACY GEOFENCE "
+    "REMAINING_TIME BATTERY_LOW BATTERY_CRITICAL BATTERY_EMERGENCY ATTITUDE MOTOR MODE_FALLBACK",
+)
+"""Cause of a failsafe; one action is held per trigger."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.profiles.px4_release import FailsafeRules
+from airl_mav.profiles.px4_release import Px4Release
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import Health, OperatorText, Setpoint, Severity
 from firmware_sim.autopilot.commander import CommanderState, FlightPhase
@@ -420,11 +420,11 @@ class Supervisor:
         self,
         value: Callable[[str], float],
         estimator: Estimator,
-        rules: FailsafeRules,
+        release: Px4Release,
         send_event: Callable[[MavlinkEvent], None] = lambda _event: None,
     ) -> None:
-        """Store the look-up for PX4 parameters, estimator, failsafe rules and event callback."""
-        self._value, self._rules = value, rules
+        """Store the look-up for PX4 parameters, estimator, PX4 release and event callback."""
+        self._value, self._release = value, release
         self._estimator = estimator
         self.watch = watch.Watch(value, estimator)
         """Monitors for signals and measurements."""
@@ -560,8 +560,11 @@ class Supervisor:
             rolled=attitude.roll,
             pitched=attitude.pitch,
             charge_short=sample.battery.remaining < self._arming.com_arm_bat_min,
+            failed_motors=self.watch.motors.failed,
+            offboard_lacks=self.watch.offboard_lacks,
             terminated=flight.mode is Mode.TERMINATION,
             armed=flight.phase >= _GROUND,
+            release=self._release.name,
         )
 
     def health(self, now_us: int) -> Health:
@@ -644,7 +647,7 @@ class Supervisor:
         now = Situation(
             *(time_us, self.conditions, self._settings, flight.intended, finished),
             armed=armed,
-            rules=self._rules,
+            rules=self._release.failsafes,
         )
         outcome = update(state, now, intervention)
         self._state = outcome.state
@@ -653,7 +656,7 @@ class Supervisor:
             flight, mode=outcome.mode, intended=outcome.intended, failsafe=outcome.state.active
         )
         text = outcome.text
-        if text and action is FailsafeAction.WARN and not self._rules.warning_has_text:
+        if text and action is FailsafeAction.WARN and not self._release.failsafes.warning_has_text:
             if text.event is not None:
                 self._send_event(text.event)
             text = None

@@ -178,16 +178,21 @@ class Watch:
             self._gcs_lost = False  # The first one is not reported.
         self._gcs_us = time_us
 
-    def offboard_lost(self, time_us: int) -> bool:
-        """Return whether no usable setpoint arrived within COM_OF_LOSS_T."""
+    @property
+    def offboard_lacks(self) -> str:
+        """Invalid estimate that the newest setpoint needs: position or velocity; "" = none."""
         setpoint = self._setpoint
-        if _silent(self.setpoint_us, time_us, self.settings.com_of_loss_t):
-            return True
         # Attitude and rate setpoints need no position estimate.
         if setpoint is None:
-            return False
+            return ""
         by_position = not math.isnan(setpoint.position[0])
-        return not (self._local if by_position else self._velocity).valid
+        valid = (self._local if by_position else self._velocity).valid
+        return "" if valid else "position" if by_position else "velocity"
+
+    def offboard_lost(self, time_us: int) -> bool:
+        """Return whether no usable setpoint arrived within COM_OF_LOSS_T."""
+        silent = _silent(self.setpoint_us, time_us, self.settings.com_of_loss_t)
+        return silent or bool(self.offboard_lacks)
 
     def hear_escs(self, time_us: int, commands: Motors, outputs: Motors) -> None:
         """Check the motor outputs reported by the speed controllers against the commands."""
@@ -313,7 +318,7 @@ class Watch:
                 (p.fd_fail_r, p.fd_fail_p),
                 (p.fd_fail_r_ttri, p.fd_fail_p_ttri),
             ),
-            fd_motor_failure=self.motors.failed,
+            fd_motor_failure=self.motors.failed != 0,
         )
 
     def _texts(

@@ -94,6 +94,12 @@ class Plans:
         """Name, old and new number of items of each stored list; the MAVLink server takes them."""
         self.reached = -1
         """Index of the newest reached item; -1 = none in this run."""
+        self.has_state = True
+        """True if a return completes the mission and its state is reported (from PX4 1.17 on)."""
+        self.valid = False
+        """True if the mission is feasible."""
+        self.finished = False
+        """True if the mission has ended in this run."""
         self.jumps_done: dict[int, int] = {}
         """Number of executions of each DO_JUMP, by index."""
         self.jumped = -1
@@ -129,8 +135,8 @@ class Plans:
         if kind is MissionType.MISSION:
             self.current = current if current >= 0 else min(self.current, max(0, len(items) - 1))
             self.jumps_done.clear()
-            self.jumped = -1
-            self.reached = -1
+            self.jumped = self.reached = -1
+            self.finished = False
 
     def clear(self, kind: MissionType) -> None:
         """Delete a list."""

@@ -52,9 +52,6 @@ _MAVLINK_VERSION = 3
 NO_MISSION = 0xFFFF
 """MISSION_CURRENT.total and HIGH_LATENCY2.wp_num without a stored mission."""
 
-_UNKNOWN_STATE = 0
-"""MISSION_CURRENT's mission_state and mission_mode: PX4 leaves them unset."""
-
 _LANDED = {
     Landed.ON_GROUND: dialect.MAV_LANDED_STATE_ON_GROUND,
     Landed.IN_AIR: dialect.MAV_LANDED_STATE_IN_AIR,
@@ -232,7 +229,7 @@ def mission_current(state: AutopilotState) -> Values:
     mission = state.mission
     total = mission.total or NO_MISSION
     ids = (mission.mission_id, mission.fence_id, mission.rally_points_id)
-    return mission.current, total, _UNKNOWN_STATE, _UNKNOWN_STATE, *ids
+    return mission.current, total, mission.state, mission.mode, *ids
 
 
 def autopilot_version(version: int) -> Values:
