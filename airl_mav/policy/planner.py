@@ -2,7 +2,7 @@
 
 A level scan of each image updates an occupancy grid (Elfes, IEEE Computer 22(6), 1989) and tracks
 of moving obstacles. Dijkstra's algorithm finds the path to the goal; unknown cells count as free.
-The policy pursues the farthest point of the path in line of sight. It predicts a set of velocities,
+The policy pursues the most distant point of the path in line of sight. It predicts a set of velocities,
 each with a brake to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard,
 Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
 """
@@ -406,7 +406,7 @@ class PlannerPolicy:
         return max(-limit, min(limit, self._settings.turn_gain_1_s * angle))
 
     def _target(self, position: Floats, goal: Floats, gap: Floats) -> Floats:
-        """Return the pursued point: the farthest one of the path in line of sight."""
+        """Return the pursued point: the most distant one of the path in line of sight."""
         assert self._map is not None  # noqa: S101 (act)
         s = self._settings
         room_m = s.radius_m + s.margin_m + 0.1
