@@ -2,9 +2,9 @@
 
 A level scan of each image updates an occupancy grid (Elfes, IEEE Computer 22(6), 1989) and tracks
 of moving obstacles. Dijkstra's algorithm finds the path to the goal; unknown cells count as free.
-The policy pursues the most distant point of the path in line of sight. It predicts a set of velocities,
-each with a brake to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard,
-Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
+The policy pursues the most distant point of the path in line of sight. It predicts a set of
+velocities, each with a brake to a stop, and takes the one with the least cost (a dynamic window:
+Fox, Burgard, Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
 """
 
 from __future__ import annotations
