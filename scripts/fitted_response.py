@@ -95,14 +95,18 @@ def _lag(
     steps: Mapping[StepName, StoredStep], names: Sequence[StepName], shares: Sequence[float]
 ) -> tuple[float, float]:
     """Return dead time and time constant [s] of the named steps, from the times of the shares."""
-    lags, times_s = [], []
+    lags: list[float] = []
+    times_s: list[float] = []
     for name in names:
         step = steps.get(name, StoredStep())
-        late_s = None if None in (step.t10_s, step.rise_s) else step.t10_s + step.rise_s
-        found = {0.1: step.t10_s, 0.5: step.t50_s, 0.9: late_s}
-        if all(found[share] is not None for share in shares):
+        t10_s, t50_s, rise_s = (
+            math.nan if time_s is None else time_s
+            for time_s in (step.t10_s, step.t50_s, step.rise_s)
+        )
+        known_s = {0.1: t10_s, 0.5: t50_s, 0.9: t10_s + rise_s}
+        if all(math.isfinite(known_s[share]) for share in shares):
             lags += [-math.log(1.0 - share) for share in shares]
-            times_s += [found[share] for share in shares]
+            times_s += [known_s[share] for share in shares]
     if not lags:
         reached = f"up to {max(shares):.0%} of it"
         raise UsageError(f"steps: accepted: with {' or '.join(names)}, {reached}")

@@ -31,7 +31,7 @@ ALGORITHMS: dict[str, Algorithm] = CORE_ALGORITHMS | {
 SHIPPED_NETWORKS = ("small", "appendix", "template")
 NetworkKind = Annotated[str, part_name(NETWORKS, SHIPPED_NETWORKS)]
 Precision = Literal["float32", "bfloat16"]
-ExpertName = Literal["greedy", "planner", "gates"]
+ExpertName = Literal["planner", "gates"]
 Option = bool | int | float | str | list[int | float | str]
 
 
@@ -144,8 +144,8 @@ class AlgorithmSpec(ProfileModel):
     )
     expert: ExpertName = Field(
         default="planner",
-        description="expert to imitate: greedy, with the policy's view, planner, with the true"
-        " arena, or gates, with the openings of the arena's gates",
+        description="expert to imitate: planner, with the true arena, or gates, with the openings"
+        " of the arena's gates",
     )
     options: dict[str, Option] = Field(
         default_factory=dict,

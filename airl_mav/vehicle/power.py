@@ -11,11 +11,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from airl_mav.core.constants import AIR_DENSITY_KG_M3, C_PER_MAH, G_PER_KG, GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.rotation import Quat, Vec
 
 INDUCED_FACTOR = 1.15
@@ -277,3 +280,18 @@ def open_circuit(remaining: float, empty_v: float, full_v: float) -> float:
 def drain(remaining: float, current_a: float, capacity_mah: float, dt: float) -> float:
     """Return the state of charge after dt [s] at a current [A], not below 0."""
     return max(0.0, remaining - current_a * (dt / (capacity_mah * C_PER_MAH)))
+
+
+def level_powers_w(vehicle: VehicleProfile, speeds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the powers (n,) of steady level flight in calm air at speeds (n,) [m/s]; 0: hover."""
+    airframe = np.array(Airframe.from_profile(vehicle))
+    return _level_powers(speeds, airframe, np.array(PowerModel.from_profile(vehicle)))
+
+
+@kernel
+def _level_powers(speeds: Vector, airframe: Vector, model: Vector) -> NDArray[np.float64]:
+    a, m = airframe_of(airframe), power_model_of(model)
+    powers = np.empty(len(speeds))
+    for i in range(len(speeds)):
+        powers[i] = level_power_w(speeds[i], a, m)
+    return powers

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from stable_baselines3.common.preprocessing import is_image_space
 
-from airl_mav.addons.imitation.imitation import StatefulExpert
 from airl_mav.camera.render import Mount, camera_pose, expose
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.navigation import Navigation
@@ -137,13 +136,6 @@ def test_noise_of_depth_is_no_fault_of_a_colour_camera() -> None:
     noise = Fault.model_validate("camera noise 10% at offboard")
     with pytest.raises(FieldError, match=r"faults.*a depth camera; the vehicle's is of kind 'rgb'"):
         Navigation(spec_of(None, knobs()), 1, faults=[noise])
-
-
-def test_the_expert_that_reads_depth_cannot_be_imitated() -> None:
-    navigation = Navigation(spec_of(None, knobs()), 1)
-    with pytest.raises(FieldError, match=r"greedy.*accepted: planner with a camera of kind 'rgb'"):
-        StatefulExpert("greedy", navigation)
-    assert StatefulExpert("planner", navigation) is not None
 
 
 @pytest.mark.nightly

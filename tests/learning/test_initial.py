@@ -60,7 +60,7 @@ def test_begins_with_the_best_weights_of_a_run(before: Path, tmp_path: Path) -> 
 def test_ppo_goes_on_from_what_an_expert_has_taught(tmp_path: Path) -> None:
     """The mean of its actions is the pupil's; how widely it explores is its own."""
     environment = TINY["environment"] | {"actions": "velocity"}
-    taught = TINY | {"environment": environment, "algorithm": {"name": "bc", "expert": "greedy"}}
+    taught = TINY | {"environment": environment, "algorithm": {"name": "bc", "expert": "planner"}}
     training_run.train(TrainingConfig.model_validate(taught), tmp_path / "taught", name="taught")
     # Rollouts no longer than the training.
     options = {"log_std_init": -1.7, "n_steps": 20, "n_epochs": 2}

@@ -118,7 +118,7 @@ def test_without_its_steps_nothing_is_found(left_out: str, words: str) -> None:
         if not name.startswith(left)
     }
     if left_out == "yawspeed-30":
-        all_steps[left_out] = StoredStep(t10_s=0.2, t50_s=0.5, rise_s=None)
+        all_steps["yawspeed-30"] = StoredStep(t10_s=0.2, t50_s=0.5, rise_s=None)
     with pytest.raises(UsageError, match=words):
         fit_response(all_steps, QUAD)
 

@@ -16,12 +16,11 @@ from airl_mav.core import errors, fields, progress
 from airl_mav.core.constants import G_PER_KG, GRAVITY_M_S2, TICK_S
 from airl_mav.core.files import read_limited
 from airl_mav.envs import fleet, fleet_step, stopping
-from airl_mav.flight.energy import level_powers_w
 from airl_mav.profiles.loading import MOST_BYTES
 from airl_mav.profiles.vehicle import CORNERS, Payload, VehicleProfile, equipped
 from airl_mav.report import document
 from airl_mav.vehicle.airframe import Airframe, command_for, steady_speed
-from airl_mav.vehicle.power import PowerModel, standing_power_w
+from airl_mav.vehicle.power import PowerModel, level_powers_w, standing_power_w
 
 THROTTLES = tuple(i / 10.0 for i in range(1, 11))
 """Commands of the motor table."""

@@ -45,7 +45,6 @@ from airl_mav.policy.actions import (
     discrete_actions,
     fastest_climb,
 )
-from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.layouts import Encoded
 from airl_mav.training import config, dqn
 
@@ -337,9 +336,6 @@ DIRECTIONS = 48
 SPEEDS = (0.2, 0.5, 0.75, 1.0)
 """Speeds in the fan, relative to the maximum."""
 
-TURN_M = 1.5
-"""Weight of a yaw rate error: equivalent speed error [m/s] per 1 rad/s."""
-
 
 class Choices(NamedTuple):
     """Candidate actions of an expert."""
@@ -379,54 +375,20 @@ class Chooser(Protocol):
         """Return the indices (n,) of the commands for the present states."""
 
 
-class GreedyPilots:
-    """Greedy baseline, one per flight; selects the nearest command. A `Chooser`."""
-
-    def __init__(self, navigation: Navigation, known: NDArray[np.float64]) -> None:
-        """Store the flights and the candidate commands (c, 3).
-
-        Raises FieldError without a depth camera.
-        """
-        if navigation.camera.kind != "depth":
-            accepted = f"planner with a camera of kind {navigation.camera.kind!r}"
-            raise FieldError("expert", "greedy", accepted)
-        self._navigation = navigation
-        self._commands = known
-        self._settings = GreedySettings(period_s=navigation.spec.episode.hold_s)
-        self.pilots = [GreedyPolicy(self._settings) for _ in range(navigation.n)]
-
-    def begin(self, slots: Sequence[int]) -> None:
-        """Reset the pilots of starting episodes."""
-        for i in slots:
-            self.pilots[i] = GreedyPolicy(self._settings)
-
-    def decide(self) -> NDArray[np.int64]:
-        """Return the indices (n,) of the commands for the present observations."""
-        seen = self._navigation.see()
-        actions = [pilot.act(seen.rows(i)) for i, pilot in enumerate(self.pilots)]
-        wanted = np.array([(a.forward_m_s, a.right_m_s, a.yaw_rate_rad_s) for a in actions])
-        # Compare all commands with the wish; a yaw rate counts as an equivalent speed.
-        off = (wanted[:, None] - self._commands) * (1.0, 1.0, TURN_M)
-        nearest: NDArray[np.int64] = (off**2).sum(axis=2).argmin(axis=1)
-        return nearest
-
-
 class StatefulExpert(sb3.Expert):
     """Expert and its memory, with checkpoint support."""
 
     def __init__(self, name: config.ExpertName, navigation: Navigation) -> None:
         """Create an expert by name, for the flights of a vectorized simulator."""
         self._navigation = navigation
-        self._chooser: Planner | GreedyPilots | GatePilot
+        self._chooser: Planner | GatePilot
         self._choices: Choices | None = None
         if name == "gates":
             self._chooser = GatePilot(navigation)
         else:
             self._choices = choices(navigation.spec.action_spec)
-            kind = Planner if name == "planner" else GreedyPilots
-            self._chooser = kind(navigation, self._choices.commands)
+            self._chooser = Planner(navigation, self._choices.commands)
         self._begun = np.zeros(navigation.n, np.bool_)
-        self._sides = np.ones(navigation.n)
 
     def begin(self, slots: Sequence[int]) -> None:
         """Start episodes in slots."""
@@ -439,15 +401,10 @@ class StatefulExpert(sb3.Expert):
         return decided if self._choices is None else self._choices.actions[decided]
 
     def _held(self) -> Mapping[str, Any]:
-        if isinstance(self._chooser, GreedyPilots):
-            self._sides[:] = [pilot.side for pilot in self._chooser.pilots]
-        return {"begun": self._begun, "sides": self._sides}
+        return {"begun": self._begun}
 
     def set_state(self, state: saved_state.State) -> None:
         """Restore a saved state; restore the flights first."""
         super().set_state(state)
         # The planner's maps and the gates' openings follow from the arenas, so they are not saved.
         self._chooser.begin(np.flatnonzero(self._begun).tolist())
-        if isinstance(self._chooser, GreedyPilots):
-            for pilot, side in zip(self._chooser.pilots, self._sides.tolist(), strict=True):
-                pilot.side = side

@@ -24,7 +24,6 @@ from airl_mav.envs.arena_batch import ArenaBatch
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.fleet import Fleet, FlightStatus, hover, new_fleet
 from airl_mav.envs.fleet_step import advance
-from airl_mav.flight.energy import level_powers_w
 from airl_mav.latency.injection import (
     FixedSampler,
     Injection,
@@ -40,6 +39,7 @@ from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.vehicle import SensorNoise, VehicleProfile
 from airl_mav.report import document, theme
+from airl_mav.vehicle.power import level_powers_w
 
 if TYPE_CHECKING:
     from airl_mav.addons.roofline.roofline import RooflineRequest
