@@ -33,6 +33,7 @@ from airl_mav.policy.planner import (
 )
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
+from airl_mav.scenario.resolve import resolve
 from tests.unit.test_greedy import arena, look
 
 S = PlannerSettings()
@@ -285,7 +286,7 @@ def flown(arena_name: str, seed: int, episodes: int, out: Path) -> list[Any]:
     scenario = Scenario(
         policy="planner", arena=arena_name, level="gym", seed=seed, episodes=episodes
     )
-    assert scenario.hold_s is None
+    assert resolve(scenario).pilot.hold_s == 0.1
     return list(rehearse(scenario, out=out).episodes)
 
 
