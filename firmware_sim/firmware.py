@@ -17,7 +17,6 @@ from airl_mav.core import clock, constants, files
 from airl_mav.core.addons import entries, load
 from airl_mav.core.frames import Goal
 from airl_mav.flight.judge import Effect
-from airl_mav.profiles.projections import SLOW, Renderer
 from firmware_sim import fault_timeline, interfaces
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import OperatorText, Severity
@@ -28,7 +27,6 @@ from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.traffic import TlogWriter
 from firmware_sim.pacing import Pacing
-from firmware_sim.plant.camera import CameraMaker, CameraProcess, SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AUTOSAVE_US = 300_000
@@ -249,7 +247,6 @@ class Firmware:
         self.logs_lost: list[str] = []
         """Messages of `on_log_lost` in the present episode."""
         self._camera = camera
-        self._slow_camera = CameraProcess()
         self._pacing = pacing
         self._recording = recording
         self._failing = failing
@@ -278,7 +275,7 @@ class Firmware:
 
         Raises:
             UsageError: The episode cannot be flown, or the firmware does not exist.
-            FirmwareLostError: External firmware died during boot, or the image process died.
+            FirmwareLostError: External firmware died during boot.
         """
         self.discard()
         self.logs_lost.clear()
@@ -293,7 +290,6 @@ class Firmware:
                 autopilot=autopilot,
                 recording=self._recording,
                 read_by=self._pacing.read_by,
-                camera_by=self._camera_by(setup.aircraft.renderer),
             )
         except BaseException:
             autopilot.close()
@@ -323,11 +319,6 @@ class Firmware:
         # Loading took wall time that is not part of the episode.
         self._pacing.restart(simulation.time_us)
         return LoadedEpisode(start_us, self.epoch_ns)
-
-    def _camera_by(self, renderer: Renderer) -> CameraMaker:
-        """Return the camera factory; with paced time, slow renderers run in a separate process."""
-        paced = self.epoch_ns is not None
-        return self._slow_camera.camera if paced and renderer in SLOW else SimulatedCamera
 
     def _open_flight_log(self, path: Path, start_unix_us: int) -> None:
         """Open the vehicle's log. Real firmware hides its state and writes its own log."""
@@ -440,7 +431,6 @@ class Firmware:
     def close(self) -> None:
         """Release everything."""
         self.discard()
-        self._slow_camera.close()
         self.flight_stack.close()
         if self._camera is not None:
             self._camera.close()

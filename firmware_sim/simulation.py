@@ -40,7 +40,7 @@ from firmware_sim.fault_timeline import ClientFaults, FaultTimeline, fault_effec
 from firmware_sim.interfaces import ActuatorControls, FlightController, SensorSample, TrueState
 from firmware_sim.pacing import Arrivals
 from firmware_sim.plant.body import FLOOR
-from firmware_sim.plant.camera import CameraMaker, OnboardCamera, SimulatedCamera
+from firmware_sim.plant.camera import OnboardCamera, SimulatedCamera
 from firmware_sim.plant.plant import Collision, Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 
@@ -175,7 +175,6 @@ class Simulation:
         autopilot: FlightController | None = None,
         recording: bool = True,
         read_by: Callable[[int], int] | None = None,
-        camera_by: CameraMaker = SimulatedCamera,
     ) -> None:
         """Put the vehicle at the start.
 
@@ -187,7 +186,6 @@ class Simulation:
             recording: True to record the flight; unrecorded flights may last indefinitely.
             read_by: For the record, maps the start of a read [µs] to a time by which the data had
                 arrived [µs]; None = reads take no time.
-            camera_by: Camera factory.
 
         Raises:
             UsageError: The vehicle's parameter overrides are invalid.
@@ -222,9 +220,9 @@ class Simulation:
         """Camera; None on an endless floor."""
         if setup.arena is not None:
             vehicle = setup.vehicle
-            self._camera = camera_by(
+            self._camera = SimulatedCamera(
                 *(vehicle.camera, setup.arena, start_us, aircraft.sensors, setup.seed),
-                *(aircraft.renderer, vehicle.cameras),
+                vehicle.cameras,
             )
             if self.faults is not None:
                 failing_camera = fault_effect("camera")

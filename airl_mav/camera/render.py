@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from airl_mav.camera.raycast import render_depth
 from airl_mav.core.addons import load_entry
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.projections import Renderer
 from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, rotate
 
 RANGE_M: Final = 10_000.0
@@ -121,22 +120,6 @@ def render(
     return image
 
 
-class Exposure(Protocol):
-    """Interface of image functions; see `expose`."""
-
-    def __call__(
-        self,
-        arena: Arena,
-        centers: NDArray[np.float64],
-        intrinsics: Intrinsics,
-        max_range: float,
-        position: Vec | NDArray[np.float64],
-        quaternion: Quat | NDArray[np.float64],
-        number: int = 0,
-    ) -> NDArray[Any]:
-        """Return the image."""
-
-
 def colour(name: str) -> Any:
     """Return a part of colour cameras. Raises UsageError without the add-on that renders colour.
 
@@ -147,16 +130,6 @@ def colour(name: str) -> Any:
     return load_entry("airl_mav", "COLOUR", name, ("camera.kind", "rgb or grey"), "colour")
 
 
-def exposure_by(renderer: Renderer, name: str = "") -> Exposure:
-    """Return the image function of a camera for a renderer; "" is the main camera."""
-    if renderer == "raycast":
-        return expose
-    option = "renderer", renderer
-    path_tracing = load_entry("airl_mav", "RENDERERS", renderer, option, "colour")
-    made: Exposure = path_tracing.images_of(name)
-    return made
-
-
 def expose(
     arena: Arena,
     centers: NDArray[np.float64],
@@ -164,11 +137,10 @@ def expose(
     max_range: float,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
-    number: int = 0,  # noqa: ARG001 (nothing is drawn by lot)
 ) -> NDArray[Any]:
     """Return a camera's image of an arena, as in `Frame.image`; see `render.render`.
 
-    Colour has no maximum depth. `number`: image number in the episode, for renderers with noise.
+    Colour has no maximum depth.
     """
     if intrinsics.kind == "depth":
         return depth_to_z16(render(arena, centers, intrinsics, max_range, position, quaternion))

@@ -326,7 +326,6 @@ EXTRAS = {
     "profile": ("onnx",),
     "data": ("minari", "pandas", "pyarrow"),
     "identify": ("mcap", "pyulog"),
-    "render": ("mitsuba",),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "PIL", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
     "view": ("viser",),

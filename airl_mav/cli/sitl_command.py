@@ -18,7 +18,6 @@ from airl_mav.core.constants import LOOPBACK
 from airl_mav.core.fields import COMMON
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.policy.card import weak_arenas
-from airl_mav.profiles.projections import SLOW
 from airl_mav.rehearsal import host_pace
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import ResolvedScenario, resolve
@@ -148,8 +147,6 @@ def _announce(scenario: ResolvedScenario, console: Console) -> None:
             return
     else:
         _say(console, f"MAVSDK     udpin://{LOOPBACK}:{asked.companion_port} (the companion's)")
-        if asked.renderer in SLOW:
-            _say(console, "camera     path traced in real time: images are as late as they take")
     if asked.firmware != "attach":
         _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
     if setup.level == "firmware" and (hint := how_to_start(asked, scenario.vehicle)) is not None:

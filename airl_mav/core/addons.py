@@ -16,7 +16,6 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     ENVIRONMENTS: {id of a Gymnasium environment: class}
     LOCKSTEP: {"firmware" or "companion": function that flies one side of two processes}
     PROFILE_SECTIONS: {section of a profile such as "arena.appearance": its model}
-    RENDERERS: {value of `--renderer`: factory of its images by camera, with a method `check`}
     SITL_OPTIONS: {option of `airl sitl`: function to a context manager around the flights}
 
 In `companion.addons`:

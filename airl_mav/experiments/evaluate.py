@@ -33,7 +33,6 @@ NOT_THE_POLICYS_OWN = (
     "time_limit_s",
     "watchdog",
     "faults",
-    "renderer",
 )
 """Fields that, when set, keep results off the policy's card."""
 

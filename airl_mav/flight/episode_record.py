@@ -54,7 +54,7 @@ class Setup:
     computer_on_ground: bool = False
     """True if the computer is ground equipment: the aircraft carries and powers none."""
     conditions: str = ""
-    """Non-default wind, load, spread, noise, charge and renderer: `wind.east_m_s 4`."""
+    """Non-default wind, load, spread, noise and charge: `wind.east_m_s 4`."""
 
 
 SCHEMA = 1

@@ -12,7 +12,6 @@ from pydantic import (
     model_validator,
 )
 
-from airl_mav.core.addons import load_entry
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, section
@@ -20,7 +19,6 @@ from airl_mav.profiles import projections
 
 if TYPE_CHECKING:
     from airl_mav.faults import Fault
-    from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.vehicle import SensorNoise
 
     Imaging: TypeAlias = Any
@@ -275,17 +273,6 @@ def check_noise(
         if (fault.part, fault.kind) == ("camera", "noise"):
             accepted = f"a depth camera; the vehicle's is of kind {camera.kind!r}"
             raise FieldError("faults", str(fault), accepted)
-
-
-def check_renderer(
-    camera: Camera, renderer: projections.Renderer, arena: ArenaSpec, further: Iterable[Camera] = ()
-) -> None:
-    """Raise FieldError for cameras or arenas that a renderer does not support."""
-    if renderer == "raycast":
-        return
-    drawn = load_entry("airl_mav", "RENDERERS", renderer, ("renderer", renderer), "colour")
-    for each in (camera, *further):
-        drawn.check(each, arena)
 
 
 def check_gym_imaging(camera: Camera, name: str = "") -> None:

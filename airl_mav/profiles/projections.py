@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, TypeVar, get_a
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core import addons, errors
+from airl_mav.core import errors
 
 if TYPE_CHECKING:
     from airl_mav.camera.intrinsics import Intrinsics
@@ -33,15 +33,6 @@ if TYPE_CHECKING:
 CameraKind = Literal["depth", "rgb", "grey"]
 """`depth`: uint16 (h, w), Z16 in millimetres. `rgb`: uint8 (h, w, 3), sRGB. `grey`: uint8
 (h, w, 1), luma of the sRGB numbers."""
-
-SLOW: Final = frozenset(addons.entries("airl_mav", "RENDERERS"))
-"""Renderers of add-ons, which need longer than a tick for an image."""
-
-if TYPE_CHECKING:
-    Renderer: TypeAlias = str
-else:
-    Renderer = Literal[("raycast", *sorted(SLOW))]
-"""Renderer of images: the ray caster, or one of an add-on."""
 
 KINDS: Final[tuple[CameraKind, ...]] = get_args(CameraKind)
 

@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.machine import code_now
 from airl_mav.faults import LINKS, PROCESSES, Fault
 from airl_mav.flight import judge
 from airl_mav.flight.episode_record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory, measure_quality
-from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
-from airl_mav.profiles.projections import SLOW
 from airl_mav.rehearsal import channel, process_pair, run_folder
 from airl_mav.scenario.resolve import ResolvedScenario
 from companion.link_interface import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
@@ -175,10 +173,8 @@ def join_episode(
         lateness_us=latency[run_folder.TICK_LATENESS],
         decisions=latency,
         frame_period_us=scenario.vehicle.camera.period_us,
-        excused=_excused(record, scenario),
+        excused=[(each.from_us, each.to_us) for each in disturbances(record.faults)],
     )
-    if _slow_images(scenario):
-        record = replace(record, notes=(*record.notes, *_told_of_images(latency)))
     if scenario.scenario.validity:
         record = replace(record, invalid=judge.host_faults(figures))
     effects = [judge.Effect(**json.loads(line)) for line in arrays["commands/effects"].tolist()]
@@ -207,33 +203,6 @@ def with_effects(
         else:
             invalid.append(f"{judge.STRANGER}: {effect.line(record.started_us)}")
     return replace(record, notes=tuple(notes), invalid=tuple(invalid), effects=tuple(effects))
-
-
-def _slow_images(scenario: ResolvedScenario) -> bool:
-    """Return True if images take longer than a tick, so that they are delayed in real time."""
-    return scenario.scenario.renderer in SLOW
-
-
-def _excused(record: EpisodeRecord, scenario: ResolvedScenario) -> list[tuple[int, int]]:
-    """Return the intervals in which requested faults excuse late decisions [µs]."""
-    if _slow_images(scenario):
-        return [(record.started_us, record.ended_us)]
-    return [(each.from_us, each.to_us) for each in disturbances(record.faults)]
-
-
-def _told_of_images(stamps: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
-    """Return a note on the number of path-traced images used and their delay."""
-    late, fetched_us = stage_durations(stamps)["t1"]
-    if not fetched_us.size:
-        return ()
-    exposed_us = np.unique(stamps["capture_us"][late])
-    span_us = int(np.ptp(exposed_us))
-    often = f", {(len(exposed_us) - 1) * US_PER_S / span_us:.1f} a second" if span_us else ""
-    median, most = (each / US_PER_MS for each in (np.median(fetched_us), fetched_us.max()))
-    return (
-        f"{len(exposed_us)} path-traced images were decided on{often}, and decoded {median:.0f} ms"
-        f" after their exposure in the median, {most:.0f} ms at most",
-    )
 
 
 def _record(

@@ -24,7 +24,7 @@ from airl_mav.core.frames import Geodetic, Goal
 from airl_mav.core.signing import StoredSigning, camera_key
 from airl_mav.faults import PROCESSES, Fault, link_fails
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import check_noise, check_renderer
+from airl_mav.profiles.camera import check_noise
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, check_spread, equipped
 from airl_mav.rehearsal import channel
@@ -323,7 +323,6 @@ def episode_of(
 ) -> tuple[EpisodeSetup, Goal]:
     """Return the episode of a loaded vehicle, and its goal. Raises UsageError without an arena."""
     spec = load_profile("arenas", asked.arena, ArenaSpec)
-    check_renderer(vehicle.camera, asked.renderer, spec, vehicle.cameras.values())
     width_m = vehicle.body.width_m
     arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
     return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), arena.goal_point

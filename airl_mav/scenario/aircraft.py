@@ -10,7 +10,6 @@ from pydantic import Field
 
 from airl_mav.core.fields import COMMON, ProfileModel, optional, quantity, switch
 from airl_mav.faults import Fault
-from airl_mav.profiles.projections import Renderer
 from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName
 from airl_mav.profiles.vehicle import Payload, SensorNoise, Spread, WindSettings
 
@@ -154,12 +153,6 @@ class Aircraft(ProfileModel):
         default=DEFAULT_PLANT,
         description="physics engine: pybullet, or the vectorized simulator's compiled rigid body"
         " (default without pybullet); not at level gym",
-    )
-    renderer: Annotated[Renderer, "sensors"] = Field(
-        default="raycast",
-        description="renderer of a colour camera: the ray caster, or Mitsuba's path tracer, a"
-        " hundred times slower: level lockstep waits for it, level sitl gets fewer and later"
-        " images; level gym does not support it",
     )
     firmware: Annotated[FirmwareName, COMMON, "firmware and links"] = Field(
         default="builtin",

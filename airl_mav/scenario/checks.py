@@ -18,7 +18,7 @@ from airl_mav.core.frames import Goal
 from airl_mav.faults import GYM, LINKS, Fault, check_gym
 from airl_mav.latency.injection import Injection, select_injection
 from airl_mav.policy import actions, registry
-from airl_mav.profiles import computer, projections
+from airl_mav.profiles import computer
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NOT_IN_GYM, Aircraft, Ports
@@ -56,7 +56,6 @@ def check_level(scenario: model.Scenario) -> None:
             if (value := getattr(scenario, field)) != getattr(usual, field):
                 raise FieldError(field, value, NOT_IN_GYM)
     check_faults(scenario, level)
-    check_drawing(scenario.renderer, level)
     if level != "lockstep" and scenario.tlogs:
         raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
     if level == "sitl" and scenario.workers is not None:
@@ -74,12 +73,6 @@ def check_start(scenario: model.Scenario) -> None:
             raise FieldError(
                 "faults", str(fault), f"start ground, as a hover start has no {fault.phase}"
             )
-
-
-def check_drawing(renderer: projections.Renderer, level: model.LevelName) -> None:
-    """Raise FieldError for a renderer that the level does not support."""
-    if renderer in projections.SLOW and level == GYM:
-        raise FieldError("renderer", renderer, "raycast, but at level lockstep or sitl")
 
 
 def check_faults(asked: Aircraft, level: model.LevelName) -> None:

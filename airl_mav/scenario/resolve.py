@@ -109,7 +109,6 @@ def resolve(scenario: Scenario, policy: registry.PolicyInfo | None = None) -> Re
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
-    camera.check_renderer(vehicle.camera, scenario.renderer, arena, further)
     resolved = ResolvedScenario(
         scenario=scenario,
         vehicle=vehicle,
@@ -322,8 +321,6 @@ class ResolvedScenario:
         for table in ("payload", "wind", "spread", "sensors"):
             for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
                 yield f"{table}.{name} {value:g}"
-        if scenario.renderer != "raycast":
-            yield f"renderer {scenario.renderer}"
         if scenario.battery_charge < 1.0:
             yield f"battery_charge {scenario.battery_charge:g}"
         yield from (f"fault: {fault}" for fault in scenario.faults)

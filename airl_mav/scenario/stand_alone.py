@@ -267,7 +267,6 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
             "without lockstep; PX4 is flown in lockstep by airl-sitl and from Python",
         )
     checks.check_faults(asked, level)
-    checks.check_drawing(asked.renderer, level)
     for fault in asked.faults:
         if fault.part in PROCESSES:
             raise FieldError(

@@ -1,24 +1,10 @@
-"""Cameras of the vehicle: schedule, images, and publication.
-
-In real time, images may take longer than a tick: `CameraProcess` renders them in a separate process
-while the vehicle keeps flying. A frame is published when it is complete, with its exposure time, as
-with a slow camera; exposures due during rendering are skipped. Otherwise the simulation waits for
-each image.
-"""
+"""Cameras of the vehicle: schedule, images, and publication."""
 
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import cached_property
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,23 +15,18 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Motion, Mount, camera_pose, colour, exposure_by
-from airl_mav.core import constants, errors, scheduling
+from airl_mav.camera.render import Motion, Mount, camera_pose, colour, expose
+from airl_mav.core import constants, errors
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.projections import Renderer
 from airl_mav.profiles.vehicle import SensorNoise
 from firmware_sim.engine.ticks import is_due
-from firmware_sim.interfaces import FirmwareLostError
 
 
 class _Eye:
     """Single camera of a vehicle, for images on a trigger."""
 
-    def __init__(
-        self, camera: Camera, arena: Arena, noise: SensorNoise, renderer: Renderer, name: str = ""
-    ) -> None:
-        """Store camera, arena, conditions and renderer; `name` is an additional camera's."""
-        self._expose = exposure_by(renderer, name)
+    def __init__(self, camera: Camera, arena: Arena, noise: SensorNoise, name: str = "") -> None:
+        """Store camera, arena and conditions; `name` is an additional camera's."""
         self._noise = noise_of(camera, noise, name)
         self._forming = colour("sensor")(camera, name) if camera.imaging is not None else None
         self.intrinsics = Intrinsics.of(camera)
@@ -72,9 +53,7 @@ class _Eye:
         else:
             at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
             centers = self._arena.centers_at(elapsed_us)
-            image = self._expose(
-                *(self._arena, centers, self.intrinsics, self._max_range, at, attitude), number
-            )
+            image = expose(self._arena, centers, self.intrinsics, self._max_range, at, attitude)
         if self._noise is not None:
             image = noisy_frame(image, self._noise, seed, number)
         return FurtherImage(image, self.intrinsics, jpeg)
@@ -132,7 +111,6 @@ class SimulatedCamera:
         start_us: int = 0,
         noise: SensorNoise | None = None,
         seed: int = 0,
-        renderer: Renderer = "raycast",
         further: Mapping[str, Camera] | None = None,
     ) -> None:
         """Create the main camera of a vehicle profile, and additional ones on its trigger.
@@ -142,9 +120,7 @@ class SimulatedCamera:
         """
         asked = noise or SensorNoise()
         cameras = {"": camera, **(further or {})}
-        self._eyes = {
-            name: _Eye(each, arena, asked, renderer, name) for name, each in cameras.items()
-        }
+        self._eyes = {name: _Eye(each, arena, asked, name) for name, each in cameras.items()}
         self._intrinsics = self._eyes[""].intrinsics
         self._in_order = any(each.follows for each in self._eyes.values())
         self._seed = seed
@@ -279,168 +255,3 @@ class OnboardCamera(Protocol):
 
     def skip_unread(self, read_us: int) -> None:
         """Skip due frames that newer ones replace before simulated `read_us` [µs], if possible."""
-
-
-CameraMaker = Callable[..., OnboardCamera]
-"""Factory of cameras, with the arguments of `SimulatedCamera`."""
-
-NICENESS = 10
-"""Niceness of the process: images may be late, but ticks must not be."""
-
-
-_Taken = tuple[Frame, int]
-"""Completed frame, and the time of the next one [µs]."""
-
-
-class CameraProcess:
-    """Process that takes the frames of the cameras of successive episodes.
-
-    Starts with the first camera, and ends with the parent process in all cases.
-    """
-
-    def __init__(self) -> None:
-        """Create the object without a process."""
-        self._line: Connection | None = None
-        self._process: subprocess.Popen[bytes] | None = None
-        self._answers: SimpleQueue[_Taken | EOFError | None] = SimpleQueue()
-        self._reading: Thread | None = None
-
-    def camera(self, camera: Camera, arena: Arena, start_us: int, *others: Any) -> SlowCamera:
-        """Return an episode's camera after a first image; arguments of `SimulatedCamera`.
-
-        The camera of the previous episode takes no further frames. Raises FirmwareLostError.
-        """
-        if self._process is None:
-            self._start()
-        self.send((camera, arena, start_us, *others))
-        while self.receive() is not None:
-            pass  # Frame of the previous episode, still in progress.
-        return SlowCamera(self, start_us)
-
-    def _start(self) -> None:
-        self._line, theirs = Pipe()
-        with theirs:
-            # Not -m: sent objects would then have the classes of __main__.
-            called = f"from {__name__} import main; main({theirs.fileno()})"
-            self._process = subprocess.Popen(  # noqa: S603 (this package)
-                [sys.executable, "-c", called],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,  # The firmware's stdout may be a channel.
-                pass_fds=[theirs.fileno()],
-            )
-        self._reading = Thread(target=self._read, args=(self._line,), name="images", daemon=True)
-        self._reading.start()
-
-    def _read(self, line: Connection) -> None:
-        """Read answers until the process has ended.
-
-        An image exceeds the pipe's buffer, so a read blocks until the writer has finished.
-        """
-        with suppress(EOFError, OSError):
-            while True:
-                self._answers.put(line.recv())
-        self._answers.put(EOFError())
-
-    @property
-    def answers(self) -> bool:
-        """True if an answer has arrived, or the process has ended."""
-        return not self._answers.empty()
-
-    def send(self, what: object) -> None:
-        """Send a request. Raises FirmwareLostError."""
-        if self._line is None:
-            raise self._lost()
-        try:
-            self._line.send(what)
-        except OSError:
-            raise self._lost() from None
-
-    def receive(self) -> _Taken | None:
-        """Wait for the next answer; None = a camera is ready. Raises FirmwareLostError."""
-        if self._line is None:
-            raise self._lost()
-        answer = self._answers.get()
-        if isinstance(answer, EOFError):
-            # Keep the end in the queue: every later call must raise as well.
-            self._answers.put(answer)
-            raise self._lost()
-        return answer
-
-    def _lost(self) -> FirmwareLostError:
-        what = "the process that draws the camera's images "
-        if self._process is None:
-            return FirmwareLostError(what + "was ended")
-        code = self._process.wait()
-        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-        return FirmwareLostError(f"{what}has ended {how}")
-
-    def close(self) -> None:
-        """End the process. Repeated calls have no effect."""
-        if self._line is not None and self._process is not None and self._reading is not None:
-            self._process.kill()
-            self._process.wait()
-            # The reader ends with the process's end of the pipe.
-            self._reading.join()
-            self._line.close()
-        self._line = self._process = self._reading = None
-
-
-class SlowCamera:
-    """Camera in another process, one frame at a time; an `OnboardCamera`."""
-
-    def __init__(self, process: CameraProcess, start_us: int) -> None:
-        """Store the process, which has created the camera, and the time of the first frame [µs]."""
-        self._process = process
-        self._busy = False
-        """True while a frame is in progress."""
-        self._taken_us: int | None = None
-        """Exposure time of the frame in progress [µs]; None = no frame, or its episode is over."""
-        self._next_us = start_us
-
-    @property
-    def next_us(self) -> int:
-        """Earliest simulated time of the next required call [µs]."""
-        return self._next_us if self._taken_us is None else self._taken_us
-
-    def restart(self, time_us: int) -> None:
-        """Start an episode at `time_us` [µs]. A frame in progress is dropped."""
-        self._taken_us, self._next_us = None, time_us
-        self._process.send(("restart", time_us))
-
-    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Publish a completed frame, and request the next one if due. Raises FirmwareLostError."""
-        if self._busy and self._process.answers:
-            taken, self._busy = self._process.receive(), False
-            # A frame of an earlier episode has another time and is dropped.
-            if taken is not None and taken[0].capture_time_us == self._taken_us:
-                self._taken_us, self._next_us = None, taken[1]
-                publish(taken[0])
-        # At most one frame is in progress, so a slow renderer cannot build up a queue.
-        if not self._busy and time_us >= self._next_us:
-            self._process.send(("take", time_us, motion))
-            self._busy, self._taken_us = True, time_us
-
-    def skip_unread(self, read_us: int) -> None:
-        """Skip nothing: the time to render decides which frames exist."""
-
-
-def main(number: int) -> None:
-    """Process requests on a connection, given by its file descriptor, until it closes."""
-    scheduling.give_way(NICENESS)
-    line = Connection(number)
-    with suppress(EOFError, OSError):
-        # Each episode begins with its camera.
-        camera = SimulatedCamera(*line.recv())
-        line.send(None)
-        while True:
-            request = line.recv()
-            if request[0] == "restart":
-                camera.restart(*request[1:])
-            elif request[0] == "take":
-                frame = camera.take(*request[1:])
-                line.send((frame, camera.next_us))
-            else:
-                camera = SimulatedCamera(*request)
-                line.send(None)
-    # Immediate exit: shutting down a renderer's threads would only take time.
-    os._exit(0)

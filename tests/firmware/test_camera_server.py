@@ -95,7 +95,7 @@ def test_images_are_drawn_when_they_are_read(monkeypatch: pytest.MonkeyPatch) ->
         drawn.append(seen)
         return expose(*seen)
 
-    monkeypatch.setattr(cams[1]._eyes[""], "_expose", drawing)
+    monkeypatch.setattr("firmware_sim.plant.camera.expose", drawing)
     frames = [
         cams[1].take(at_us, Motion.at_rest(north + at_us * 1e-6, turned)) for at_us in times_us
     ]

@@ -12,7 +12,7 @@ from airl_mav.addons.colour.batch import ColourImages, Looks
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, Mount
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.envs.arena_batch import batch_of
 from airl_mav.envs.mesh_batch import MeshesSeen
 from airl_mav.envs.observations import COMPILED
@@ -47,16 +47,6 @@ learning_starts = 100
 [selection]
 every = 300
 episodes = 2
-"""
-
-
-SMALL = """
-base = "quad-rgb"
-description = "few pixels, seldom: its images are path traced"
-[camera]
-width_px = 32
-height_px = 24
-rate_hz = 5.0
 """
 
 
@@ -128,54 +118,6 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
     assert len({each.image.tobytes() for each in seen}) == len(seen)
     assert [len(each.earlier) for each in seen[:3]] == [0, 1, 2]
-
-
-@pytest.mark.nightly
-def test_a_flight_sees_what_is_path_traced(policy: Path, tmp_path: Path) -> None:
-    """Close to the ray caster's, not the same; the same flight again sees the same again."""
-    pytest.importorskip("mitsuba")
-    small = tmp_path / "small.toml"
-    small.write_text(SMALL, encoding="utf-8")
-    first: dict[str, list[bytes]] = {}
-    images: dict[str, np.ndarray] = {}
-    for name, renderer in (("cast", "raycast"), ("traced", "mitsuba"), ("again", "mitsuba")):
-        asked = scenario(policy, vehicle=str(small), renderer=renderer, time_limit_s=1.5)
-        assert ("renderer mitsuba" in asked.setup.conditions) == (renderer == "mitsuba")
-        seen: list[Observation] = []
-        learned = asked.fresh_policy(SEED)
-        assert isinstance(learned, LearnedPolicy)
-        fly(asked, Watching(learned, seen), 0, SEED)
-        first[name] = [each.image.tobytes() for each in seen]
-        images[name] = seen[0].image
-    assert first["traced"] == first["again"]
-    assert len(set(first["traced"])) == len(first["traced"]) > 1
-    apart = np.abs(images["traced"].astype(float) - images["cast"]).mean()
-    assert 0.0 < apart < 0.1 * 255.0
-
-
-@pytest.mark.parametrize(
-    ("changes", "accepted"),
-    [
-        ({"level": "gym"}, "raycast, but at level lockstep or sitl"),
-        ({"shipped": "static-obstacles", "vehicle": "quad"}, "raycast with a depth camera"),
-        ({"arena": "varied-looks"}, "raycast in an arena with fog"),
-    ],
-)
-def test_where_nothing_is_path_traced_says_so(
-    policy: Path, changes: dict[str, object], accepted: str
-) -> None:
-    flown = Path(str(changes.pop("shipped", policy)))
-    with pytest.raises(FieldError, match="renderer") as raised:
-        scenario(flown, **({"renderer": "mitsuba"} | changes))
-    assert accepted in str(raised.value)
-
-
-@pytest.mark.nightly
-def test_what_was_path_traced_goes_onto_no_card(policy: Path) -> None:
-    pytest.importorskip("mitsuba")
-    words = ("--vehicle", "quad-rgb", "--level", "lockstep", "--renderer", "mitsuba", "--on-card")
-    with pytest.raises(UsageError, match="--renderer mitsuba: accepted: without on-card"):
-        airl("evaluate", str(policy), *words)
 
 
 def test_what_does_not_see_alike_is_refused_in_one_line(policy: Path) -> None:

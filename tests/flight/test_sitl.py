@@ -402,22 +402,3 @@ def test_a_crash_is_judged_and_the_run_goes_on(tmp_path: Path) -> None:
     for episode in run.episodes:
         assert "hit " in episode["reason"]
     assert "Traceback" not in run.output
-
-
-@pytest.mark.nightly
-def test_path_traced_images_come_late_and_the_flight_says_so(tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba")
-    words = ("--policy", "static-obstacles-rgb-fast", "--vehicle", "quad-rgb", "--episodes", "1")
-    seen = ("--arena", "varied-looks-clear", "--renderer", "mitsuba")
-    done = sitl(tmp_path, *words, *seen, report=False)
-    (episode,) = done.episodes
-    assert not episode["invalid"]
-    (note,) = (each for each in episode["notes"] if "path-traced" in each)
-    assert note in " ".join(done.output.split())
-    archive = done.arrays("latency.npz")
-    stamps = {key: archive[f"000/{key}"] for key in ("capture_us", "decoded_us")}
-    known = (stamps["capture_us"] != NO_STAMP) & (stamps["decoded_us"] != NO_STAMP)
-    age_us = (stamps["decoded_us"] - stamps["capture_us"])[known]
-    assert (age_us > 0).all()
-    assert note.startswith(f"{len(np.unique(stamps['capture_us'][known]))} path-traced images")
-    assert f"decoded {np.median(age_us) / 1e3:.0f} ms after their exposure" in note

@@ -92,9 +92,7 @@ def test_the_plant_s_cameras_take_the_same_images(rig: Path, arena: str) -> None
         motion = Motion(fleet.position[i], fleet.quaternion[i], fleet.velocity[i], fleet.omega[i])
         assert np.abs(motion.velocity).max() > 0.5
         seed = int(env.seeds[i])
-        plant = SimulatedCamera(
-            *(env.camera, world, 0, noise, seed, "raycast", env.vehicle.cameras)
-        )
+        plant = SimulatedCamera(*(env.camera, world, 0, noise, seed, env.vehicle.cameras))
         taken = plant._eyes
         twin = {"": env.cameras._main, **env.cameras.further}
         assert taken.keys() == twin.keys() == {"", "down", "left", "right"}

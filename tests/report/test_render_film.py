@@ -106,21 +106,6 @@ def test_a_video_has_every_picture(folder: Path, tmp_path: Path, show: Shown) ->
         assert np.abs(off).mean() < 4.0
 
 
-@pytest.mark.nightly
-def test_a_flight_is_path_traced(folder: Path, tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba")
-    words = ("--rate-hz", "1", "--width-px", "48", "--height-px", "32", "--samples", "16")
-    films = {}
-    for renderer in ("raycast", "mitsuba"):
-        out = tmp_path / f"{renderer}.webp"
-        render(str(folder), "1", *words, "--renderer", renderer, "--out", str(out))
-        with Image.open(out) as image:
-            films[renderer] = [np.array(f.convert("RGB")) for f in ImageSequence.Iterator(image)]
-    assert len(films["mitsuba"]) == len(films["raycast"]) > 2
-    apart = [abs(a.astype(float) - b).mean() for a, b in zip(*films.values(), strict=True)]
-    assert 0.0 < max(apart) < 0.1 * 255.0, "the same views, in other light"
-
-
 def test_a_video_of_odd_size_is_refused(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("av")
     out = tmp_path / "x.mp4"

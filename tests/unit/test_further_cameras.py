@@ -19,7 +19,7 @@ from airl_mav.core.streams import Stream, stream, words_of
 from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.registry import PolicyInfo, camera_refused
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera, check_gym_imaging, check_noise, check_renderer
+from airl_mav.profiles.camera import Camera, check_gym_imaging, check_noise
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.profiles.vehicle import SensorNoise, VehicleProfile, load_vehicle
 from companion.limits import ground_in_view
@@ -195,9 +195,6 @@ def test_conditions_of_depth_are_refused_where_no_camera_gives_any() -> None:
     check_noise(COLOUR, noise, (), further=[GREY, RIG.camera])
     with pytest.raises(FieldError, match=r"sensors\.depth_noise 0\.1: accepted: 0 with a camera"):
         check_noise(COLOUR, noise, (), further=[GREY])
-    spec = load_profile("arenas", "no-obstacles", ArenaSpec)
-    with pytest.raises(FieldError, match="raycast with a depth camera; mitsuba draws colour"):
-        check_renderer(COLOUR, "mitsuba", spec, [RIG.camera])
 
 
 def test_a_gain_that_takes_time_names_its_camera() -> None:

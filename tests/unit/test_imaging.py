@@ -30,9 +30,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, expose
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera import Camera, check_renderer
-from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.projections import CameraKind
 from tests.unit.test_colour import arena, bodies, sky, sun
 
@@ -437,8 +435,5 @@ def test_what_does_not_go_together_is_refused(
         camera(kind, **imaging)
 
 
-def test_the_path_tracer_does_not_form_images() -> None:
-    spec = load_profile("arenas", "varied-looks-clear", ArenaSpec)
-    with pytest.raises(FieldError, match=r"renderer.*raycast with a camera that has a table"):
-        check_renderer(camera(), "mitsuba", spec)
+def test_an_empty_table_has_the_defaults() -> None:
     assert Imaging() == camera().imaging

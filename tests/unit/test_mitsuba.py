@@ -12,19 +12,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from airl_mav.addons.colour.mitsuba import PathTracer
 from airl_mav.addons.colour.picture import antialiased, render_picture
 from airl_mav.addons.colour.profile import Appearance
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.meshes import kept, ring, scene_of, triangles
-
-pytest.importorskip("mitsuba")
+from tests.support.mitsuba_scene import path_traced
 
 LIGHT: dict[str, Any] = {
     "sun": {"azimuth_deg": [200, 200], "elevation_deg": [42, 42], "irradiance": [0.6, 0.6]},
@@ -43,19 +40,6 @@ PLAIN = {
 }
 
 CAMERA = Intrinsics.from_fov(96, 64, 1.5)
-
-
-def path_traced(
-    scene: Arena,
-    centers: Any,
-    camera: Intrinsics,
-    place: Any,
-    turn: Any,
-    *,
-    samples: int,
-    seed: int = 0,
-) -> NDArray[np.uint8]:
-    return PathTracer(samples)(scene, centers, camera, place, turn, seed)
 
 
 def arena(name: str, seed: int, **appearance: Any) -> Arena:
@@ -240,13 +224,3 @@ def test_hills_are_theirs(material: str) -> None:
     theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=16)
     ours = antialiased(flat, centers, CAMERA, place, attitude, 4)
     assert float(np.abs(ours.astype(float) - theirs).mean()) / 255.0 > 0.02
-
-
-def test_what_it_has_not_is_refused() -> None:
-    fog = arena("no-obstacles", 0, fog={"extinction_1_m": [0.1, 0.1]})
-    place, level = np.array([0.0, 0.0, -2.5]), quat_from_euler(0, 0, 0)
-    with pytest.raises(UsageError, match=r"without appearance\.fog"):
-        path_traced(fog, fog.obstacles.center, CAMERA, place, level, samples=1)
-    clear, fisheye = arena("no-obstacles", 0), Intrinsics.from_fov(72, 54, 3.0, "fisheye")
-    with pytest.raises(UsageError, match="projection pinhole"):
-        path_traced(clear, clear.obstacles.center, fisheye, place, level, samples=1)

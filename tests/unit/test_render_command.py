@@ -101,15 +101,6 @@ def test_moving_obstacles_move(tmp_path: Path) -> None:
     assert (before != after).any()
 
 
-@pytest.mark.nightly  # Pixel by pixel: test_mitsuba.py. Films by it: test_render_film.py.
-def test_mitsuba_draws_the_same_view(tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba")
-    words = ("dense-obstacles", "--seed", "5", *POSE, *SMALL)
-    ours = render(tmp_path, *words).astype(int)
-    theirs = render(tmp_path, *words, "--renderer", "mitsuba", "--samples", "16")
-    assert np.abs(ours - theirs).mean() < 0.06 * 255.0
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -127,16 +118,6 @@ def test_what_cannot_be_drawn_is_one_line(
         render(tmp_path, *words)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_mitsuba_has_neither_depth_nor_fog(tmp_path: Path) -> None:
-    pytest.importorskip("mitsuba")
-    with pytest.raises(UsageError, match="--show depth: accepted: rgb with --renderer mitsuba"):
-        render(tmp_path, "--renderer", "mitsuba", "--show", "depth")
-    foggy = tmp_path / "foggy.toml"
-    foggy.write_text('base = "no-obstacles"\n[appearance.fog]\nextinction_1_m = [0.1, 0.1]\n')
-    with pytest.raises(UsageError, match=r"without appearance\.fog"):
-        render(tmp_path, str(foggy), "--renderer", "mitsuba")
 
 
 def test_only_png_files_are_written(tmp_path: Path) -> None:

@@ -440,7 +440,6 @@ BEFORE = {
     "park": "0455810b97515a5a",
     "static-obstacles": "fb0b627b2f6b3f57",
     "varied-looks": "ab7d97e5851cfe13",
-    "varied-looks-clear": "3b2b4795f806b948",
 }
 """Digests from the version before rooms were added."""
 

@@ -1,11 +1,11 @@
 """Colour cameras: appearance of arenas, their rendering, image sensors, and `airl render`.
 
-Renders sRGB with sun, shadows, textures, reflections and fog in real time, or path traced by
-Mitsuba; depth, segmentation and optical flow of the same pixels; motion blur, exposure control,
-noise and JPEG of an image sensor. Used by cameras of kind rgb and grey, by the table `appearance`
-of arenas and `imaging` of cameras, and by `--renderer mitsuba`.
+Renders sRGB with sun, shadows, textures, reflections and fog in real time; depth, segmentation and
+optical flow of the same pixels; motion blur, exposure control, noise and JPEG of an image sensor.
+Used by cameras of kind rgb and grey, and by the tables `appearance` of arenas and `imaging` of
+cameras.
 Command: `airl render`.
-Depends on: the extra `render` for path tracing, `film` for videos.
+Depends on: the extra `film` for videos.
 Guide: docs/explanation/colour.md.
 """
 
@@ -24,4 +24,3 @@ PROFILE_SECTIONS = {
     "arena.appearance": f"{_HERE}.profile:Appearance",
     "camera.imaging": f"{_HERE}.profile:Imaging",
 }
-RENDERERS = {"mitsuba": f"{_HERE}.profile:PathTracing"}

@@ -31,9 +31,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load, trust_arenas
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
-SAMPLES = {"raycast": 16, "mitsuba": 64}
-
-FILM_SAMPLES = {"raycast": 4, "mitsuba": 16}
+STILL_RAYS, FILM_RAYS = 16, 4
 
 STILL_PX, FILM_PX = (960, 640), (384, 256)
 
@@ -46,7 +44,7 @@ OF_AN_ARENA = (
 OF_A_FLIGHT = ("flight", "rate_hz", "trust")
 
 OF_NO_VEHICLE = (
-    *("show", "renderer", "samples", "projection", "width_px", "height_px", "fov_deg", "range_m"),
+    *("show", "samples", "projection", "width_px", "height_px", "fov_deg", "range_m"),
     "distortion",
 )
 """Options that are not supported with a vehicle profile's camera, which defines them."""
@@ -65,11 +63,9 @@ class RenderOptions(ProfileModel):
         airl render forest.toml --north-m 10 --height-m 3 --yaw-deg 30 --out forest.png
         airl render dense-obstacles --show segmentation --out seen.png
         airl render dense-obstacles --show flow --speed-m-s 5 --out flow.npy
-        airl render dense-obstacles --renderer mitsuba --samples 256
         airl render varied-looks --camera my-quad.toml --speed-m-s 5 --yaw-rate-deg-s 60
         airl render varied-looks --camera quad-rig --camera-name down
         airl render runs/A 7 --out flight.gif
-        airl render runs/A 7 --renderer mitsuba --out flight.mp4
     """
 
     subject: Annotated[str, POSITIONAL] = Field(
@@ -109,11 +105,8 @@ class RenderOptions(ProfileModel):
         le=1000,
         default=0.0,
     )
-    renderer: Annotated[projections.Renderer, COMMON] = Field(
-        default="raycast", description="renderer; mitsuba draws rgb only, without fog"
-    )
     samples: int | None = quantity(
-        "rays or paths a pixel; by default 16, of mitsuba 64, in a film 4 and 16; a camera has one",
+        "rays a pixel; by default 16, in a film 4; a camera has one",
         "1",
         ge=1,
         le=4096,
@@ -212,10 +205,6 @@ def _check(options: RenderOptions, filmed: bool) -> None:
     projections.check_lens("fov_deg", options.projection, options.fov_deg, options.distortion)
     if options.out is not None and options.out.suffix.lower() == pictures.VIDEO:
         check_installed("film")
-    if options.renderer == "mitsuba":
-        check_installed("render")
-        if options.show != "rgb":
-            raise FieldError("show", options.show, "rgb with --renderer mitsuba")
 
 
 def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
@@ -253,13 +242,8 @@ def _camera(options: RenderOptions, size: tuple[int, int]) -> intrinsics.Intrins
 
 
 def _drawn(options: RenderOptions, samples: int) -> pictures.Drawn:
-    """Return the renderer, with a number of rays or paths per pixel."""
-    if options.renderer == "mitsuba":
-        # Imported here: Mitsuba is an extra.
-        from airl_mav.addons.colour.mitsuba import PathTracer
-
-        return partial(PathTracer(samples), seed=0)
-    rays = math.ceil(math.sqrt(samples))
+    """Return the renderer, by default with `samples` rays per pixel."""
+    rays = math.ceil(math.sqrt(options.samples or samples))
     return partial(pictures.still, show=options.show, rays=rays, range_m=options.range_m)
 
 
@@ -292,7 +276,7 @@ def _picture(options: RenderOptions, out: Path) -> str:
             return options.show
         pictures.write_png(out, pictures.coloured_flow(truth))
         return "picture"
-    drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
+    drawn = _drawn(options, STILL_RAYS)
     pictures.write_png(out, drawn(arena, centers, camera, position, attitude))
     return "picture"
 
@@ -303,7 +287,7 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
         trust_arenas(load(folder))
     run = ReplayedRun(folder)
     record = run.records[0] if options.flight is None else run.record(options.flight)
-    drawn = _drawn(options, options.samples or FILM_SAMPLES[options.renderer])
+    drawn = _drawn(options, FILM_RAYS)
     camera = _camera(options, FILM_PX)
     flight = run.flight(record)
     times = pictures.moments(flight, options.rate_hz)

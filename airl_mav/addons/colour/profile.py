@@ -7,7 +7,6 @@ drawn uniformly for each seed. Colours are sRGB, 0-255.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
@@ -20,13 +19,9 @@ from pydantic import (
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, optional, quantity, switch
-from airl_mav.core.streams import words_of
 from airl_mav.profiles.loading import CheckedFile
-from airl_mav.profiles.projections import PROJECTIONS
 
 if TYPE_CHECKING:
-    from airl_mav.camera.render import Exposure
-    from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.camera import Camera
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
@@ -445,32 +440,3 @@ class Imaging(ProfileModel):
             if (value := getattr(self, name)) > period_ms:
                 accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
                 raise FieldError(f"camera.imaging.{name}", value, accepted)
-
-
-class PathTracing:
-    """Renderer `mitsuba`: a path tracer, the reference of the ray caster's colour images."""
-
-    @staticmethod
-    def images_of(name: str) -> Exposure:
-        """Return the image function of a camera by its name; "" is the main one."""
-        # Imported here: Mitsuba is optional, and commands check options early.
-        from airl_mav.addons.colour.mitsuba import PathTraced
-
-        return PathTraced(1 + sum(words_of(name)))
-
-    @staticmethod
-    def check(camera: Camera, arena: ArenaSpec) -> None:
-        """Raise FieldError for a camera or an arena that Mitsuba does not support."""
-        accepted = None
-        if camera.kind == "depth":
-            accepted = "raycast with a depth camera; mitsuba draws colour"
-        elif not PROJECTIONS[camera.projection].planar:
-            accepted = f"raycast with a camera of projection {camera.projection!r}"
-        elif camera.imaging is not None:
-            accepted = "raycast with a camera that has a table imaging"
-        elif arena.appearance.fog.drawn:
-            accepted = "raycast in an arena with fog"
-        elif find_spec("mitsuba") is None:
-            accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"
-        if accepted is not None:
-            raise FieldError("renderer", "mitsuba", accepted)

@@ -48,7 +48,6 @@ BESIDE = (
     "real",
     "plant",
     "estimator",
-    "renderer",
     "faults",
     "payload",
     "battery_charge",

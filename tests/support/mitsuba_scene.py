@@ -1,7 +1,7 @@
-"""Arenas and cameras as scenes of Mitsuba 3: path tracing, the reference of `picture`, without fog.
+"""Arenas as scenes of Mitsuba 3, a path tracer: the reference of the colour images, without fog.
 
-Adds ambient occlusion and colour bleeding, which the fast renderer only averages below a ceiling.
-Mitsuba only has pinholes: cameras of other projections are refused.
+Adds ambient occlusion and colour bleeding, which the ray caster only averages below a ceiling.
+Mitsuba only has pinholes.
 """
 
 from __future__ import annotations
@@ -10,17 +10,18 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from airl_mav.addons.colour import appearance
-from airl_mav.addons.colour.picture import grey
 from airl_mav.addons.colour.shading import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.addons.colour.textures import mean_of, periods, texels
 from airl_mav.arena import geometry, triangles
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import RANGE_M
-from airl_mav.core import errors, frames
-from airl_mav.vehicle.rotation import Quat, Vec
+from airl_mav.core import frames
+
+mi: Any = pytest.importorskip("mitsuba")
 
 Floats = NDArray[np.float64]
 
@@ -31,58 +32,32 @@ MOST_BOUNCES = 8
 
 _SKY_ROWS = 256
 
-_SEEDS = 1 << 32
-"""Number of distinct seeds in Mitsuba."""
+
+def path_traced(
+    arena: geometry.Arena,
+    centers: Floats,
+    camera: Intrinsics,
+    position: Floats,
+    quaternion: Floats,
+    *,
+    samples: int,
+) -> NDArray[np.uint8]:
+    """Return the sRGB image of an arena, with `samples` paths a pixel."""
+    assert arena.look.light.extinction == 0.0
+    assert camera.model.planar
+    mi.set_variant(VARIANT)
+    # Only `volpath` lets sunlight through glass.
+    glass = bool((arena.look.finish.surface == GLASS).any())
+    integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
+    bodies = _lights(arena.look.light) | _bodies(arena, centers)
+    scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
+    sensor = mi.load_dict(_sensor(frames.quat_to_matrix(quaternion).T, position, camera, samples))
+    light = np.array(mi.render(scene, sensor=sensor, seed=0))[..., :3]
+    encoded: NDArray[np.uint8] = np.rint(255.0 * appearance.srgb_of(light)).astype(np.uint8)
+    return encoded
 
 
-class PathTracer:
-    """Path-traced images; reuses the last scene while nothing in it moves."""
-
-    def __init__(self, samples: int) -> None:
-        """Set the paths per pixel."""
-        self._samples = samples
-        self._arena: geometry.Arena | None = None
-        self._centers: Floats = np.zeros((0, 3))
-        self._scene: Any = None
-
-    def __call__(
-        self,
-        arena: geometry.Arena,
-        centers: Floats,
-        intrinsics: Intrinsics,
-        position: Floats,
-        quaternion: Floats,
-        seed: int,
-    ) -> NDArray[np.uint8]:
-        """Return the sRGB image of an arena; arguments as in `render.render`.
-
-        Raises UsageError for an arena with fog or a camera other than a pinhole, ImportError
-        without Mitsuba (the extra `render`).
-        """
-        if arena.look.light.extinction > 0.0:
-            raise errors.UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
-        if not intrinsics.model.planar:
-            raise errors.UsageError("renderer mitsuba: accepted: a camera of projection pinhole")
-        import mitsuba as mi
-
-        mi.set_variant(VARIANT)
-        if arena is not self._arena or not np.array_equal(centers, self._centers):
-            self._arena, self._centers = arena, np.array(centers)
-            # Only `volpath` lets sunlight through glass.
-            glass = bool((arena.look.finish.surface == GLASS).any())
-            integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
-            bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
-            self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
-        axes = frames.quat_to_matrix(quaternion).T
-        sensor = mi.load_dict(_sensor(mi, axes, position, intrinsics, self._samples))
-        light = np.array(mi.render(self._scene, sensor=sensor, seed=seed))[..., :3]
-        encoded: NDArray[np.uint8] = np.rint(255.0 * appearance.srgb_of(light)).astype(np.uint8)
-        return encoded
-
-
-def _sensor(
-    mi: Any, axes: Floats, position: Floats, camera: Intrinsics, samples: int
-) -> dict[str, Any]:
+def _sensor(axes: Floats, position: Floats, camera: Intrinsics, samples: int) -> dict[str, Any]:
     """Return a pinhole camera; axes (3, 3) forward, right, down."""
     forward, right, down = axes
     # Mitsuba's camera looks along +z; x points to the left of the image, y up.
@@ -106,7 +81,7 @@ def _sensor(
     }
 
 
-def _lights(mi: Any, light: appearance.Light) -> dict[str, Any]:
+def _lights(light: appearance.Light) -> dict[str, Any]:
     """Return sun and sky. A white surface reflects 1 / pi of its irradiance in each direction."""
     # Sine of each row's elevation; 0 below the horizon.
     sine = np.sin((0.5 - (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS) * math.pi).clip(0.0)
@@ -131,44 +106,41 @@ def _lights(mi: Any, light: appearance.Light) -> dict[str, Any]:
     return lights
 
 
-def _bodies(mi: Any, arena: geometry.Arena, centers: Floats) -> dict[str, Any]:
+def _bodies(arena: geometry.Arena, centers: Floats) -> dict[str, Any]:
     b, finish, o = arena.bounds, arena.look.finish, arena.obstacles
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     half_n, half_e, half_h = b.north_max - north, b.east_max - east, 0.5 * b.height
     x, y, z = np.eye(3)
     made = [
         # Across is east, along (down in the pattern's image) is south.
-        _face(mi, finish, appearance.FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
-        _ground(mi, finish),
+        _face(finish, appearance.FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
+        _ground(finish),
     ]
     for side in (-1.0, 1.0):
         at = np.array([north + side * half_n, east, -half_h])
-        made.append(_face(mi, finish, appearance.WALLS, at, half_e * y, half_h * z))
+        made.append(_face(finish, appearance.WALLS, at, half_e * y, half_h * z))
         at = np.array([north, east + side * half_e, -half_h])
-        made.append(_face(mi, finish, appearance.WALLS, at, half_n * x, half_h * z))
+        made.append(_face(finish, appearance.WALLS, at, half_n * x, half_h * z))
     if b.ceiling:
-        made.append(
-            _ceiling(mi, arena.look.light, np.array([north, east, -b.height]), half_n, half_e)
-        )
+        made.append(_ceiling(arena.look.light, np.array([north, east, -b.height]), half_n, half_e))
     if arena.ground is not None:
-        made.append(_hills(mi, finish, arena.ground))
+        made.append(_hills(finish, arena.ground))
     for each in arena.meshes:
-        made.append(_mesh(mi, finish, appearance.OBSTACLE + each.first, each))
+        made.append(_mesh(finish, appearance.OBSTACLE + each.first, each))
     for i in range(len(o)):
         if arena.mesh_of(i) is not None:
             continue
         row, half, at = appearance.OBSTACLE + i, o.half_size[i], centers[i]
         if o.shape[i] == geometry.Shape.BOX:
-            made += _box(mi, finish, row, at, half, float(o.yaw[i]))
+            made += _box(finish, row, at, half, float(o.yaw[i]))
         elif o.shape[i] == geometry.Shape.CYLINDER:
-            made += _cylinder(mi, finish, row, at, half)
+            made += _cylinder(finish, row, at, half)
         else:
-            made.append(_sphere(mi, finish, row, at, float(half[0])))
+            made.append(_sphere(finish, row, at, float(half[0])))
     return {f"body_{k}": body for k, body in enumerate(made)}
 
 
 def _face(
-    mi: Any,
     finish: appearance.Finish,
     row: int,
     center: Floats,
@@ -186,12 +158,12 @@ def _face(
     per_m = _per_m(finish, row)
     size, begin = (2.0 * width * per_m, 2.0 * height * per_m), finish.offset[row]
     start = (float(first[0] * per_m + begin[0]), float(first[1] * per_m + begin[1]))
-    bsdf = _material(mi, finish, row, size, start)
+    bsdf = _material(finish, row, size, start)
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": bsdf}
 
 
 def _ceiling(
-    mi: Any, light: appearance.Light, center: Floats, half_n: float, half_e: float
+    light: appearance.Light, center: Floats, half_n: float, half_e: float
 ) -> dict[str, Any]:
     """Return a ceiling that emits light downwards and reflects nothing."""
     pose = np.diag([half_n, half_e, 1.0, 1.0])
@@ -204,7 +176,7 @@ def _ceiling(
     }
 
 
-def _ground(mi: Any, finish: appearance.Finish) -> dict[str, Any]:
+def _ground(finish: appearance.Finish) -> dict[str, Any]:
     """Return the ground beyond the walls, slightly below the floor, with its mean albedo."""
     dark, bright = finish.albedo[appearance.FLOOR]
     mean = dark + mean_of(finish, appearance.FLOOR) * (bright - dark)
@@ -215,27 +187,26 @@ def _ground(mi: Any, finish: appearance.Finish) -> dict[str, Any]:
 
 
 def _box(
-    mi: Any, finish: appearance.Finish, row: int, center: Floats, half: Floats, yaw: float
+    finish: appearance.Finish, row: int, center: Floats, half: Floats, yaw: float
 ) -> list[dict[str, Any]]:
     cos, sin = math.cos(yaw), math.sin(yaw)
     axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     a, b, c = half[:, None] * axes
     faces = [(a, b, c), (b, a, c), (c, a, b)]
     return [
-        _face(mi, finish, row, center + side * out, across, along, origin=center)
+        _face(finish, row, center + side * out, across, along, origin=center)
         for out, across, along in faces
         for side in (-1.0, 1.0)
     ]
 
 
 def _cylinder(
-    mi: Any, finish: appearance.Finish, row: int, center: Floats, half: Floats
+    finish: appearance.Finish, row: int, center: Floats, half: Floats
 ) -> list[dict[str, Any]]:
     radius, height, per_m = float(half[0]), float(half[2]), _per_m(finish, row)
     begin = finish.offset[row]
     # The second texture coordinate runs from end to end, here from the top down.
     bsdf = _material(
-        mi,
         finish,
         row,
         (_around(finish, row, radius), 2.0 * height * per_m),
@@ -253,32 +224,28 @@ def _cylinder(
     return [side, *caps]
 
 
-def _sphere(
-    mi: Any, finish: appearance.Finish, row: int, center: Floats, radius: float
-) -> dict[str, Any]:
+def _sphere(finish: appearance.Finish, row: int, center: Floats, radius: float) -> dict[str, Any]:
     around, begin = _around(finish, row, radius), finish.offset[row]
     # The second texture coordinate runs from the pole at +z down to the opposite pole.
-    bsdf = _material(mi, finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
+    bsdf = _material(finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
     return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
 
 
-def _mesh(mi: Any, finish: appearance.Finish, row: int, placed: geometry.PlacedMesh) -> Any:
+def _mesh(finish: appearance.Finish, row: int, placed: geometry.PlacedMesh) -> Any:
     """Return a mesh of flat triangles. Its pattern matches `surfaces.shade_meshes`."""
     vertices, faces = triangles.standing(placed)
     corners = placed.scale * triangles.triangles_of(placed.file).corners.astype(np.float64)
-    return _triangles(mi, finish, row, corners, vertices[faces])
+    return _triangles(finish, row, corners, vertices[faces])
 
 
-def _hills(mi: Any, finish: appearance.Finish, ground: geometry.Ground) -> Any:
+def _hills(finish: appearance.Finish, ground: geometry.Ground) -> Any:
     """Return hills with the floor's pattern: across is east, along is south."""
     corners = ground.points[ground.faces]
     own = corners[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
-    return _triangles(mi, finish, appearance.FLOOR, own, corners)
+    return _triangles(finish, appearance.FLOOR, own, corners)
 
 
-def _triangles(
-    mi: Any, finish: appearance.Finish, row: int, corners: Floats, placed: Floats
-) -> Any:
+def _triangles(finish: appearance.Finish, row: int, corners: Floats, placed: Floats) -> Any:
     """Return flat triangles with a pattern as in `surfaces.shade_meshes`.
 
     `corners` (m, 3, 3) are along the mesh's axes, `placed` (m, 3, 3) NED [m]; `row` is the
@@ -292,7 +259,7 @@ def _triangles(
     # Both are in periods, so the texture needs no transform.
     places = _per_m(finish, row) * np.stack([across, along], axis=-1) + finish.offset[row]
     properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(_material(mi, finish, row, (1.0, 1.0), (0.0, 0.0)))
+    properties["mesh_bsdf"] = mi.load_dict(_material(finish, row, (1.0, 1.0), (0.0, 0.0)))
     count = len(corners)
     # Vertices are not shared, because each triangle has its own texture coordinates.
     mesh = mi.Mesh("mesh", 3 * count, count, has_vertex_texcoords=True, props=properties)
@@ -345,7 +312,6 @@ def _reflecting(finish: appearance.Finish, row: int, albedo: dict[str, Any]) -> 
 
 
 def _material(
-    mi: Any,
     finish: appearance.Finish,
     row: int,
     size: tuple[float, float],
@@ -367,32 +333,3 @@ def _material(
         "to_uv": mi.ScalarTransform4f(place),
     }
     return _reflecting(finish, row, texture)
-
-
-PATHS = 16
-"""Mitsuba paths per pixel; the noise resembles a sensor in daylight."""
-
-
-class PathTraced:
-    """Colour images from Mitsuba's path tracer; each image number has different noise."""
-
-    def __init__(self, first: int = 0) -> None:
-        """Store the noise seed of image 0; later images count up from it, modulo 2^32."""
-        self._tracer = PathTracer(PATHS)
-        self._first = first
-
-    def __call__(
-        self,
-        arena: geometry.Arena,
-        centers: NDArray[np.float64],
-        intrinsics: Intrinsics,
-        max_range: float,  # noqa: ARG002 (colour has no limit)
-        position: Vec | NDArray[np.float64],
-        quaternion: Quat | NDArray[np.float64],
-        number: int = 0,
-    ) -> NDArray[Any]:
-        """Return the image; see `expose`. Raises as `mitsuba.PathTracer`."""
-        pose = np.asarray(position), np.asarray(quaternion)
-        seed = (self._first + number) % _SEEDS
-        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=seed)
-        return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]
