@@ -44,6 +44,7 @@ _NAN3 = np.full(3, math.nan)
 STOP = Setpoint(_NAN3, np.zeros(3), math.nan, 0.0)
 
 PARAMETERS: dict[str, float] = {
+    "AHRS_EKF_TYPE": 10,  # the default with no_time_sync
     "FRAME_CLASS": 1,
     "FRAME_TYPE": 0,  # PLUS, the default
     "GUID_TIMEOUT": 3.0,
