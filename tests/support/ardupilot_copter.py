@@ -162,6 +162,9 @@ class Copter:
         if not self._position_ok:
             self.say(2, "Arm: Need Position Estimate")
             return Result.FAILED
+        if self.mode in (BRAKE, LAND):
+            self.say(2, f"Arm: {'BRAKE' if self.mode == BRAKE else 'LAND'} mode not armable")
+            return Result.FAILED
         self.inner.set_mode(Mode.HOLD)
         if self.inner.arm(force=False) is not Result.ACCEPTED:
             self.say(2, "Arm: EKF attitude is bad")
