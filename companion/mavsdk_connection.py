@@ -184,6 +184,9 @@ ARDUPILOT = Dialect(
     arm_timeout_s=90.0,
 )
 
+SET_GUIDED = {"target_component": 1, "command": 176, "param1": 1.0, "param2": 4.0}
+"""COMMAND_LONG to ArduPilot: DO_SET_MODE with a custom mode, GUIDED."""
+
 
 def dialect_of(autopilot: Autopilot) -> Dialect:
     """Return the dialect of MAVSDK's kind of autopilot; unknown kinds are treated as PX4."""

@@ -219,11 +219,7 @@ class MavsdkLink:
         """
         self._texts = texts = ServerUtility(self._system)
         self.hear_texts(heard)
-
-        def send(text: str) -> None:
-            texts.send_status_text(StatusTextType.DEBUG, text)
-
-        return send
+        return lambda text: texts.send_status_text(StatusTextType.DEBUG, text)
 
     def close(self) -> None:
         """Release MAVSDK."""
@@ -286,9 +282,8 @@ class MavsdkLink:
         """Return armed state, flight mode and charge."""
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
-        remaining = self.battery().remaining
         return link_interface.VehicleStatus(
-            self.armed, mode is FlightMode.OFFBOARD, words, remaining
+            self.armed, mode is FlightMode.OFFBOARD, words, self.battery().remaining
         )
 
     def battery(self) -> link_interface.BatteryState:
@@ -324,7 +319,6 @@ class MavsdkLink:
         deadline_us = self._deadline(timeout_s)
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
         missing: list[str] = []
-        # The loop ends once health was good without interruption for HEALTH_SETTLE_S.
         while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * constants.US_PER_S):
             lacking = f" ({', '.join(missing)})" if missing else ""
             late = f"not healthy after {timeout_s:g} s: it refuses to arm{lacking}"
@@ -346,6 +340,10 @@ class MavsdkLink:
                 return
             except ActionError as error:
                 self._check(deadline_us, f"arming failed: {_reason(error)}", stop)
+                if self.dialect is mavsdk_connection.ARDUPILOT:
+                    # After a landing MAVSDK arms in BRAKE, which ArduPilot refuses.
+                    target = {"target_system": self._system.get_system_id()}
+                    self.send_message("COMMAND_LONG", target | mavsdk_connection.SET_GUIDED)
                 self._pause(ARM_RETRY_S)
 
     def _tell_origin(self, origin: tuple[float, float, float], due_us: int) -> int:
@@ -556,7 +554,6 @@ def _known(value: float) -> float | None:
 
 
 def _refusal(error: TelemetryError) -> str:
-    # Only a timeout needs the hint; other results carry their reason.
     if error.args[0] != TelemetryResult.TIMEOUT:
         return _reason(error)
     return (

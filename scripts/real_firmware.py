@@ -290,10 +290,12 @@ def steps(command: Command, firmware: Firmware) -> dict[str, Any]:
 
 
 def conformance(command: Command, firmware: Firmware) -> dict[str, Any]:
-    """Return the result of airl conformance; the steps are flown in lockstep, see `steps`."""
+    """Return the result of airl conformance, without the steps of the part `steps`."""
     folder, speed = command.out / firmware.name, speed_of(command)
     found = folder / "conformance.partial.json"
-    argv = ["-m", "airl_mav.cli.main", "conformance", "--skip-steps", "--speed", f"{speed:g}"]
+    argv = ["-m", "airl_mav.cli.main", "conformance", "--speed", f"{speed:g}"]
+    if firmware.kind in PARTS["steps"][1]:
+        argv.append("--skip-steps")
     with flying(command, firmware, speed) as vehicle:
         argv += ["--connect", f"udpin://127.0.0.1:{vehicle.port}", "--out", str(found)]
         run(argv, folder / "conformance.log", accepted=(0, 1))
@@ -467,19 +469,19 @@ def judged_steps(estimated: Results, number: int) -> Row:
     return Row("steps beyond the stored column", f"{text}: {'; '.join(outside) or 'none'}")
 
 
-def outcome_row(name: str, real: Sequence[str], builtin: Sequence[str] | None, n: int) -> Row:
-    """Return a row of failed checks or tests of `n`."""
+def outcome_row(name: str, real: Mapping[str, bool], builtin: Mapping[str, bool] | None) -> Row:
+    """Return a row of checks or tests; True = passed."""
 
-    def text(failed: Sequence[str]) -> str:
-        listed = f": {', '.join(failed)}" if failed else ""
-        return f"{n - len(failed)} of {n}{listed}"
+    def text(passed: Mapping[str, bool]) -> str:
+        failed = ", ".join(each for each in passed if not passed[each])
+        return f"{sum(passed.values())} of {len(passed)}{': ' if failed else ''}{failed}"
 
     return Row(name, text(real), "" if builtin is None else text(builtin))
 
 
-def failed_checks(data: Results) -> list[str]:
-    """Return the names of failed checks of airl conformance."""
-    return [check["name"] for check in data["checks"] if check["outcome"] == "fail"]
+def checks_of(data: Results) -> dict[str, bool]:
+    """Return the checks of airl conformance, by name; True = passed or not applicable."""
+    return {check["name"]: check["outcome"] != "fail" for check in data["checks"]}
 
 
 def tests_of(data: Results, number: int) -> dict[str, bool]:
@@ -545,9 +547,8 @@ def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) 
                 rows += paired_rows(*folders)
     if found := real.get("conformance"):
         other = builtin.get("conformance")
-        failed = None if other is None else failed_checks(other)
-        n = len(found["checks"])
-        rows.append(outcome_row("conformance checks", failed_checks(found), failed, n))
+        beside_it = None if other is None else checks_of(other)
+        rows.append(outcome_row("conformance checks", checks_of(found), beside_it))
     if (found := real.get("walk")) and (other := builtin.get("walk")):
         same = agreement(found["answers"], other["answers"])
         share = 100.0 * same.agree / max(same.comparable, 1)
@@ -555,9 +556,7 @@ def rows_of(out: Path, name: str, real: Results, beside: str, builtin: Results) 
         rows.append(Row("walk", text, f"{same.calls} calls"))
     if found := real.get("tests"):
         flown = [tests_of(each, number) for each in (found, builtin.get("tests")) if each]
-        bad = [[name for name, passed in each.items() if not passed] for each in flown]
-        beside_it = bad[1] if len(bad) > 1 else None
-        rows.append(outcome_row("PX4's tests", bad[0], beside_it, len(flown[0])))
+        rows.append(outcome_row("PX4's tests", flown[0], flown[1] if len(flown) > 1 else None))
     return rows
 
 

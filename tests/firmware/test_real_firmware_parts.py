@@ -212,6 +212,11 @@ def ardupilot_set_right() -> dict[str, int | float]:
     return {**functions, "FRAME_CLASS": 1, "FRAME_TYPE": 1}
 
 
+def test_ardupilot_flies_by_its_own_estimate() -> None:
+    """With no_time_sync its default is the simulator's true state (SIM_JSON.cpp)."""
+    assert ardupilot(quad()).settings["AHRS_EKF_TYPE"] == 3.0
+
+
 def test_a_wrong_ardupilot_frame_is_told() -> None:
     frame, held = ardupilot(quad()), ardupilot_set_right()
     assert frame.problem(held) is None

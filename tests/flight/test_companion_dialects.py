@@ -88,6 +88,8 @@ def test_a_flight_on_ardupilot() -> None:
         link.land(60.0)
         assert copter.mode == LAND
         assert not copter.armed
+        link.arm(link.dialect.arm_timeout_s, NEVER)
+        assert copter.mode == GUIDED
 
 
 @pytest.mark.slow

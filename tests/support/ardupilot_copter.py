@@ -44,6 +44,7 @@ _NAN3 = np.full(3, math.nan)
 STOP = Setpoint(_NAN3, np.zeros(3), math.nan, 0.0)
 
 PARAMETERS: dict[str, float] = {
+    "AHRS_EKF_TYPE": 10,  # the default with no_time_sync
     "FRAME_CLASS": 1,
     "FRAME_TYPE": 0,  # PLUS, the default
     "GUID_TIMEOUT": 3.0,
@@ -160,6 +161,9 @@ class Copter:
     def arm(self) -> Result:
         if not self._position_ok:
             self.say(2, "Arm: Need Position Estimate")
+            return Result.FAILED
+        if self.mode in (BRAKE, LAND):
+            self.say(2, f"Arm: {'BRAKE' if self.mode == BRAKE else 'LAND'} mode not armable")
             return Result.FAILED
         self.inner.set_mode(Mode.HOLD)
         if self.inner.arm(force=False) is not Result.ACCEPTED:

@@ -86,6 +86,7 @@ def test_a_firmware_without_a_part_has_a_dash(bench: Any, tmp_path: Path) -> Non
         ("builtin", "steps", steps(step(0.20, 3.5))),
         ("copter", "identity", version),
         ("copter", "conformance", {"checks": checks}),
+        ("builtin", "conformance", {"checks": checks[:1]}),
     ):
         file = tmp_path / name / f"{part}.json"
         file.parent.mkdir(exist_ok=True)
@@ -94,7 +95,7 @@ def test_a_firmware_without_a_part_has_a_dash(bench: Any, tmp_path: Path) -> Non
     lines = text.splitlines()
     assert lines[0] == "| figure | 1.17 | builtin | copter | builtin |"
     assert "| north-2 latency | 220 ms (+10.0 %) | 200 ms | – | – |" in lines
-    assert "| conformance checks | – | – | 1 of 2: land | – |" in lines
+    assert "| conformance checks | – | – | 1 of 2: land | 1 of 1 |" in lines
     assert "- copter: land: x" in lines
     data = json.loads((tmp_path / "drift.json").read_text())
     assert data["1.17"]["rows"][0]["real"] == "1.17.0 (abc)"

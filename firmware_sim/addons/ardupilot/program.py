@@ -104,7 +104,8 @@ def ardupilot_airframe(vehicle: VehicleProfile) -> parameters.RequiredAirframe:
             f"SERVO{i + 1}_FUNCTION": _ARDUPILOT_MOTOR_1 + CORNERS.index(copter.motors[i])
             for i in range(len(copter.motors))
         },
-        settings={**kind, **copter.parameters},
+        # With no_time_sync ArduPilot's default is 10: the true state in place of an estimate.
+        settings={"AHRS_EKF_TYPE": 3.0, **kind, **copter.parameters},
         problem=partial(_ardupilot_problem, copter.motors, kind),
     )
 
@@ -132,9 +133,8 @@ def _check_arducopter(real: RealFirmware) -> None:
         find_arducopter(real.ardupilot_dir)
 
 
-def _how_to_start(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None:
+def _how_to_start(aircraft: Aircraft, _: VehicleProfile) -> str | None:
     """Return the user's command to start ArduCopter from its source tree."""
-    del vehicle
     real, ports = aircraft.real, aircraft.ports
     if not real.ardupilot_connect:
         return None
