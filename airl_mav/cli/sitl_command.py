@@ -88,7 +88,8 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
 def weakness(scenario: ResolvedScenario) -> str:
     """Return a warning if the policy's card has a low success rate in this arena; empty if not."""
     policy, arena = scenario.policy, scenario.arena_name
-    rate = weak_arenas(() if policy.card is None else policy.card.results).get(arena)
+    weak = weak_arenas(() if policy.card is None else policy.card.results)
+    rate = {Path(name).stem: each for name, each in weak.items()}.get(arena)
     told = f"warning: {policy.name} reaches {rate or 0.0:.0%} of the goals in {arena}, by its card"
     return "" if rate is None else f"{told}; airl evaluate planner compares"
 

@@ -92,7 +92,10 @@ def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
             _draw_field(ax, x, y, heat.fields.get((row, column)), shades, norm)
     ax.set_xlim(-0.5, len(heat.columns) - 0.5)
     ax.set_ylim(-0.5, len(heat.rows) - 0.5)
-    ax.set_xticks(range(len(heat.columns)), [f"{column}" for column in heat.columns])
+    names = [f"{column}" for column in heat.columns]
+    # Long names overlap: tilt them.
+    tilted: Any = {"rotation": 25, "ha": "right"} if max(map(len, names)) > 12 else {}
+    ax.set_xticks(range(len(names)), names, **tilted)
     ax.set_yticks(range(len(heat.rows)), [f"{row}" for row in heat.rows])
     theme.label_axes(ax, heat.column_title, heat.row_title)
     ax.set_title(heat.title, loc="left", fontsize=10.5, color=theme.INK, pad=16 if heat.note else 6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.loading import load_published
 from airl_mav.scenario.model import DEFAULT_POLICY
@@ -92,16 +94,17 @@ def generalisation_paper(records: Records) -> str:
 
 @block("policies-in-arenas", "policies-in-arenas")
 def policies_in_arenas(records: Records) -> str:
-    runs = records["policies-in-arenas"].runs
-    arenas = tuple(dict.fromkeys(run.arena for run in runs.values()))
+    runs = records["policies-in-arenas"].runs.values()
+    at = {(run.policy, run.arena): run.success_rate for run in runs}
+    arenas = tuple(dict.fromkeys(run.arena for run in runs))
     rows = []
-    for policy in dict.fromkeys(run.policy for run in runs.values()):
+    for policy in dict.fromkeys(run.policy for run in runs):
         own = find_policy(policy).card
         trained = None if own is None else own.training.arena
-        cells = [number(runs[f"{policy}-{a}"].success_rate, 1, scale=100.0) for a in arenas]
+        cells = [number(at[policy, arena], 1, scale=100.0) for arena in arenas]
         cells = [f"**{c}**" if a == trained else c for a, c in zip(arenas, cells, strict=True)]
         rows.append((f"`{policy}`" + (" (classical)" if own is None else ""), *cells))
-    return table(("policy", *arenas), rows, len(arenas))
+    return table(("policy", *(Path(arena).stem for arena in arenas)), rows, len(arenas))
 
 
 # --- without one input
