@@ -332,11 +332,11 @@ def test_policies_are_found_by_name_and_by_path(
         monkeypatch.setattr(module, "profiles_dir", lambda: exported.parent / "shipped")
     shutil.copytree(exported, exported.parent / "shipped" / "policies")
     monkeypatch.chdir("/")
-    assert policy_names() == ["greedy", "continuous", "discrete"]
+    assert policy_names() == ["greedy", "planner", "continuous", "discrete"]
     assert isinstance(load_policy("continuous", 0.5), LearnedPolicy)
     with pytest.raises(UsageError) as error:
         find_policy("discreet")
-    assert "greedy, continuous, discrete (or a path" in str(error.value)
+    assert "greedy, planner, continuous, discrete (or a path" in str(error.value)
 
 
 def test_greedy_takes_no_runtime_and_no_ablation() -> None:
