@@ -247,7 +247,7 @@ def test_compensation_says_what_flies_how(tmp_path: Path) -> None:
     few: dict[str, Any] = {"FACTORS": (0.5,), "LATENCIES": (0.5,), "IMAGES": (1,)}
     with patch.multiple(importlib.import_module("compensation"), **few):
         config = (SCRIPTS / "compensation.toml").read_text()
-        code, text = study("compensation", config, tmp_path / "out", "--episodes", "3")
+        code, text = study("compensation", config, tmp_path / "out", "--episodes", "8")
     assert code == 0
     lines = (tmp_path / "out" / "compensation.md").read_text().splitlines()
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "|" in line]
@@ -259,7 +259,7 @@ def test_compensation_says_what_flies_how(tmp_path: Path) -> None:
         asked = Scenario(
             level="gym",
             seed=700_000,
-            episodes=3,
+            episodes=8,
             latency="11ms" if compensate is None else "396ms",
             compensate=compensate,
         )

@@ -48,7 +48,9 @@ def test_the_shipped_pages_say_what_their_cards_say(shipped: Path) -> None:
     for found, result in zip(entry["results"], card.results, strict=True):
         assert result.arena in found["dataset"]["name"]
         values = {metric["type"]: metric["value"] for metric in found["metrics"]}
-        wanted = {field: getattr(result, field) for field, _, _ in QUALITIES}
+        # Without a success there are no times.
+        measured = {field: getattr(result, field) for field, _, _ in QUALITIES}
+        wanted = {field: value for field, value in measured.items() if value is not None}
         assert values == pytest.approx(wanted, abs=1e-4)
     assert f"{card.parameters:,} parameters" in body
 
