@@ -10,15 +10,14 @@ import sys
 import gymnasium
 from stable_baselines3 import PPO
 
-from airl_mav.envs.sb3 import NavigationVecEnv
-from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.envs.sb3 import make_vec_env
 
 KNOBS = {"arena": "no-obstacles", "actions": "velocity"}
 
 
 def main() -> None:
     """Train, then fly three episodes in each simulator."""
-    vectorized = NavigationVecEnv(NavigationVectorEnv(64, **KNOBS))
+    vectorized = make_vec_env(64, **KNOBS)
     learner = PPO("MultiInputPolicy", vectorized, n_steps=32, batch_size=512, seed=1, device="cpu")
     learner.learn(30_000)
     places = {

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 
 from airl_mav.core.errors import UsageError
 from airl_mav.envs import saved_state, vector
+from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.layouts import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
@@ -83,7 +84,7 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done):
             final = info["final_info"]
-            episode = {key: _plain(final[key][i]) for key in QUALITY}
+            episode = {key: final[key].item(i) for key in QUALITY}
             episode |= {"r": float(self._return[i]), "l": int(self._length[i])}
             infos[i] = {
                 "terminal_observation": info["final_obs"][i],
@@ -136,6 +137,6 @@ class NavigationVecEnv(saved_state.Stateful, VecEnv):
         return [None] * self.num_envs
 
 
-def _plain(value: Any) -> Any:
-    """Return a numpy scalar as a Python scalar."""
-    return value.item() if isinstance(value, np.generic) else value
+def make_vec_env(n: int, spec: EnvironmentSpec | None = None, **knobs: Any) -> NavigationVecEnv:
+    """Create n flights for stable-baselines3; arguments and errors as of `NavigationVectorEnv`."""
+    return NavigationVecEnv(vector.NavigationVectorEnv(n, spec, **knobs))

@@ -197,7 +197,7 @@ def further_images(observation_space: spaces.Dict) -> list[str]:
     return sorted(key for key in found if key != main)
 
 
-def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
+def policy_arguments(spec: NetworkSpec = NetworkSpec()) -> dict[str, Any]:  # noqa: B008 (frozen)
     """Return the `policy_kwargs` of a MultiInputPolicy; FieldError for a missing extractor."""
     extractor: Any = ImageExtractor
     if spec.own:

@@ -24,10 +24,9 @@ from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_succes
 from airl_mav.envs.fleet import FlightStatus
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
-from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.sb3 import NavigationVecEnv, make_vec_env
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.stopping import bounded
-from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import SHIPPED
 from airl_mav.rehearsal.run_folder import locked
@@ -136,11 +135,10 @@ def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> N
 def environment_of(config: TrainingConfig) -> NavigationVecEnv:
     """Create a training's environment. Raises UsageError, or FieldError with the file's fields."""
     try:
-        made = NavigationVectorEnv(config.vehicles, config.environment)
+        return make_vec_env(config.vehicles, config.environment)
     except FieldError as error:
         field = f"environment.{error.field}"
         raise FieldError(field, error.value, error.accepted, error.problem) from None
-    return NavigationVecEnv(made)
 
 
 def learner_of(config: TrainingConfig, env: NavigationVecEnv, device: str) -> BaseAlgorithm:

@@ -34,10 +34,10 @@ EXAMPLES = ROOT / "examples"
 AIRL = "from airl_mav.cli.main import airl; airl()"
 
 
-def output_of(name: str, folder: Path, *arguments: str) -> str:
+def output_of(name: str, folder: Path, *arguments: str, timeout_s: float = 280.0) -> str:
     """Return what an example prints, run in an empty folder."""
     with running([str(EXAMPLES / name), *arguments], folder) as program:
-        assert program.wait(280.0) == 0, program.text()
+        assert program.wait(timeout_s) == 0, program.text()
         return program.text()
 
 
@@ -149,6 +149,24 @@ def test_cleanrl_ppo_learns_by_itself_and_its_agent_can_be_exported(tmp_path: Pa
     seen = random_inputs(facts.observation, 3, np.random.default_rng(0))
     scores = agent(*(torch.from_numpy(seen[key]) for key in boxes(facts.observation)))
     assert scores.shape == (3, discrete_actions(facts.actions))
+
+
+@pytest.mark.nightly  # It learns in 100 s of CPU time, which a busy host stretches.
+@pytest.mark.timeout(1800)
+def test_sb3_ppo_learns(tmp_path: Path) -> None:
+    text = output_of("sb3_ppo.py", tmp_path, timeout_s=1700.0)
+    (success,) = numbers_after(r"^([\d.]+) % of 300 flights reached the goal$", text)
+    assert success >= 95.0
+    assert (tmp_path / "static-obstacles.zip").is_file()
+
+
+def test_sb3_ppo_runs_with_few_steps(tmp_path: Path) -> None:
+    program = (EXAMPLES / "sb3_ppo.py").read_text(encoding="utf-8")
+    for many, few in (("150_000", "1"), ('"n_steps": 128', '"n_steps": 8'), ("1, 301", "1, 3")):
+        assert many in program
+        program = program.replace(many, few)
+    (tmp_path / "few.py").write_text(program, encoding="utf-8")
+    assert re.search(r"^[\d.]+ % of 2 flights", output_of(f"{tmp_path}/few.py", tmp_path), re.M)
 
 
 @pytest.mark.nightly

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.navigation_env import FIRST_TRAINING_SEED, NavigationEnv
-from airl_mav.envs.sb3 import QUALITY, NavigationVecEnv
+from airl_mav.envs.sb3 import QUALITY, NavigationVecEnv, make_vec_env
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.actions import commands
@@ -272,14 +272,10 @@ def test_the_curriculum_is_shared_by_all_vehicles() -> None:
 # --- stable-baselines3
 
 
-def sb3_env(n: int, **knobs: Any) -> NavigationVecEnv:
-    return NavigationVecEnv(NavigationVectorEnv(n, **knobs))
-
-
 def test_sb3_adapter_tells_what_the_vector_environment_tells() -> None:
     knobs: dict[str, Any] = {"arena": "dynamic-obstacles", "episode": {"time_limit_s": 4.0}}
     n = 3
-    env, plain = VecCheckNan(sb3_env(n, **knobs)), NavigationVectorEnv(n, **knobs)
+    env, plain = VecCheckNan(make_vec_env(n, **knobs)), NavigationVectorEnv(n, **knobs)
     env.seed(12)
     assert_same(env.reset(), plain.reset(seed=12)[0])
     total, length, ends = np.zeros(n), np.zeros(n, int), 0
@@ -312,8 +308,9 @@ def test_sb3_adapter_tells_what_the_vector_environment_tells() -> None:
 
 def test_sb3_learns_and_evaluates_without_a_warning() -> None:
     """pytest turns warnings into errors: no missing render_mode, no missing Monitor."""
-    knobs = {"episode": {"time_limit_s": 3.0}, "image_width_px": 64, "image_height_px": 48}
-    env = sb3_env(2, **knobs)
+    knobs: dict[str, Any] = {"episode": {"time_limit_s": 3.0}}
+    knobs |= {"image_width_px": 64, "image_height_px": 48}
+    env = make_vec_env(2, **knobs)
     assert env.render_mode is None
     model = PPO("MultiInputPolicy", env, n_steps=8, batch_size=8, n_epochs=1, seed=3, device="cpu")
     model.learn(16)
@@ -326,7 +323,7 @@ def test_sb3_learns_and_evaluates_without_a_warning() -> None:
 
 
 def test_sb3_s_other_methods() -> None:
-    env = sb3_env(3, arena="no-obstacles")
+    env = make_vec_env(3, arena="no-obstacles")
     assert env.env_is_wrapped(Monitor) == [True] * 3
     assert env.env_is_wrapped(VecMonitor, indices=[0]) == [False]
     assert env.get_attr("num_envs", indices=[1]) == [3]
@@ -365,7 +362,7 @@ def through_a_file(state: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 )
 def test_a_restored_environment_goes_on_bit_for_bit(knobs: dict[str, Any], steps: int) -> None:
     n, more = 3, 40
-    env = sb3_env(n, **knobs)
+    env = make_vec_env(n, **knobs)
     env.seed(2)
     env.reset()
     rng = np.random.default_rng(1)
@@ -376,7 +373,7 @@ def test_a_restored_environment_goes_on_bit_for_bit(knobs: dict[str, Any], steps
     state, seen = through_a_file(env.get_state()), env.observe()
     went_on = [env.step(action) for action in actions[steps:]]
 
-    other = sb3_env(n, **knobs)
+    other = make_vec_env(n, **knobs)
     other.set_state(state)
     assert_same(other.observe(), seen)
     assert_same([other.step(action) for action in actions[steps:]], went_on)
@@ -391,7 +388,7 @@ def test_a_restored_environment_goes_on_bit_for_bit(knobs: dict[str, Any], steps
 
 
 def test_a_saved_state_does_not_change_with_the_environment() -> None:
-    env = sb3_env(2, **BUSY)
+    env = make_vec_env(2, **BUSY)
     env.seed(1)
     env.reset()
     state = env.get_state()
@@ -413,14 +410,14 @@ def test_a_state_before_the_first_reset_can_be_kept_too() -> None:
 
 
 def test_a_state_of_another_environment_is_refused() -> None:
-    env = sb3_env(2, arena="no-obstacles")
+    env = make_vec_env(2, arena="no-obstacles")
     env.seed(1)
     env.reset()
     state = env.get_state()
     with pytest.raises(UsageError, match="state: of an environment with another arena, reward"):
-        sb3_env(2, reward="paper").set_state(state)
+        make_vec_env(2, reward="paper").set_state(state)
     with pytest.raises(UsageError, match=r"seeds is int64 \(2,\); accepted: int64 \(3,\)"):
-        sb3_env(3, arena="no-obstacles").set_state(state)
+        make_vec_env(3, arena="no-obstacles").set_state(state)
     with pytest.raises(UsageError, match="nothing of 'vector' in it"):
         env.set_state({})
     del state["vector/flights/fleet/memory"]
