@@ -66,8 +66,7 @@ AROUND = 1.6
 """Side of a map, relative to the distance of the goal along the longer axis."""
 
 LEAST, MOST, SURE = -2.0, 8.0, 5.0
-"""Evidence of a cell: one more for each return, one less for each look through it; its limits, and
-the evidence of a static obstacle."""
+"""Evidence of a cell, +1 a return, -1 a view through it: limits, and a static obstacle's."""
 
 SIGHT_M = 15.0
 """Maximum distance of the pursued point [m]."""
@@ -313,8 +312,7 @@ def _groups(points: Floats, ranges: Floats) -> list[tuple[int, int, bool]]:
     ]
 
 
-COURSES = 32
-SPEEDS = (0.12, 0.25, 0.5, 0.75, 1.0)
+COURSES, SPEEDS = 32, (0.12, 0.25, 0.5, 0.75, 1.0)
 """Candidates: courses, and speeds relative to the maximum."""
 
 CREEP = 0.25

@@ -93,7 +93,6 @@ def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
     ax.set_xlim(-0.5, len(heat.columns) - 0.5)
     ax.set_ylim(-0.5, len(heat.rows) - 0.5)
     names = [f"{column}" for column in heat.columns]
-    # Long names overlap: tilt them.
     tilted: Any = {"rotation": 25, "ha": "right"} if max(map(len, names)) > 12 else {}
     ax.set_xticks(range(len(names)), names, **tilted)
     ax.set_yticks(range(len(heat.rows)), [f"{row}" for row in heat.rows])
