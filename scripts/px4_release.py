@@ -19,7 +19,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from pyulog import ULog
 
@@ -335,12 +335,12 @@ def main() -> int:
     ):
         print(f"usage: px4_release.py {'|'.join(get_args(PX4ReleaseName))} TREE [LOG.ulg]")
         return 2
-    release, tree, *log = sys.argv[1:]
+    release, (tree, *log) = cast("PX4ReleaseName", sys.argv[1]), sys.argv[2:]
     try:
         if log:
-            write(release, Path(tree), Path(*log))  # type: ignore[arg-type]  # matched above
+            write(release, Path(tree), Path(*log))
         else:
-            update_events(release, Path(tree))  # type: ignore[arg-type]
+            update_events(release, Path(tree))
     except (OSError, UsageError, subprocess.CalledProcessError) as error:
         print(f"px4_release.py: {error}")
         return 2

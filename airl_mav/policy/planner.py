@@ -371,13 +371,13 @@ class PlannerPolicy:
         hits = points[seen & ~moving]
         self._map.look(position, yaw, fov, ranges, hits)
         gap = self._map.gaps(hits, s.comfort_m)
-        target = self._target(position, goal, gap)
+        target = self._target(self._map, position, goal, gap)
         told = observation.in_flight
         lead_s = s.dead_time_s + (s.latency_s if told is None else float(told.latency_s))
         velocity = to_world @ observation.velocity[:2]
         bearing = math.atan2(target[1] - position[1], target[0] - position[0])
         wishes = self._wishes(bearing, yaw, fov)
-        costs = self._costs(wishes, lead_s, position, velocity, goal, target, gap)
+        costs = self._costs(self._map, wishes, lead_s, position, velocity, goal, target, gap)
         self._last = wishes[int(costs.min(axis=0).argmin())]
         turn = self._turn(bearing - yaw)
         # The velocity turns with the nose during the hold: aim so that the mean course is right.
@@ -403,19 +403,18 @@ class PlannerPolicy:
         limit = self._settings.max_yaw_rate_rad_s
         return max(-limit, min(limit, self._settings.turn_gain_1_s * angle))
 
-    def _target(self, position: Floats, goal: Floats, gap: Floats) -> Floats:
+    def _target(self, known: OccupancyMap, position: Floats, goal: Floats, gap: Floats) -> Floats:
         """Return the pursued point: the most distant one of the path in line of sight."""
-        assert self._map is not None  # noqa: S101 (act)
         s = self._settings
         room_m = s.radius_m + s.margin_m + 0.1
-        if self._map.is_clear(gap, position, goal, room_m):
+        if known.is_clear(gap, position, goal, room_m):
             return goal
-        path = self._map.path(position, goal, gap, s)
+        path = known.path(position, goal, gap, s)
         best = path[min(2, len(path) - 1)]
         for point in path[:: max(1, len(path) // 40)]:
             if float(np.hypot(*(point - position))) > SIGHT_M:
                 break
-            if self._map.is_clear(gap, position, point, room_m):
+            if known.is_clear(gap, position, point, room_m):
                 best = point
         return np.asarray(best)
 
@@ -430,6 +429,7 @@ class PlannerPolicy:
 
     def _costs(
         self,
+        known: OccupancyMap,
         wishes: Floats,
         lead_s: float,
         position: Floats,
@@ -443,7 +443,6 @@ class PlannerPolicy:
         A cost is the time to the target, at the maximum speed from the end of the prediction, plus
         a charge for small gaps. A collision dominates it: later and shallower ones cost less.
         """
-        assert self._map is not None  # noqa: S101 (act)
         s = self._settings
         movers = [track for track in self._tracks if track.moving]
         straight_on = np.array(STRAIGHT_ON_S)[:, None, None]
@@ -453,7 +452,7 @@ class PlannerPolicy:
         held_s = lead_s + s.period_s
         cost, hit, there = np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
         # Too close already: only getting closer is a collision.
-        least = min(s.margin_m, float(self._map.gap_at(gap, position)) - s.radius_m - 0.05)
+        least = min(s.margin_m, float(known.gap_at(gap, position)) - s.radius_m - 0.05)
         for step in range(1, 1 + math.ceil((held_s + STRAIGHT_ON_S[-1] + BRAKING_S) / STEP_S)):
             t = step * STEP_S
             asked = self._last if t <= lead_s else np.where(t <= held_s + straight_on, wishes, 0.0)
@@ -461,7 +460,7 @@ class PlannerPolicy:
             most = s.brake_m_s2 * STEP_S / np.maximum(np.hypot(*np.moveaxis(change, -1, 0)), 1e-9)
             going = going + change * np.minimum(1.0, most)[..., None]
             at = at + STEP_S * going
-            static = self._map.gap_at(gap, at) - s.radius_m
+            static = known.gap_at(gap, at) - s.radius_m
             moving = np.full(shape, np.inf)
             for track in movers:
                 off = at - (track.position + t * track.velocity)

@@ -2,7 +2,7 @@
 
 The rows also define component health for clients (SYS_STATUS). Source: PX4 1.16 to 1.18,
 commander/HealthAndArmingChecks, without checks of components that this vehicle lacks. Texts and
-levels are those of the current release; `checks` returns those of any release.
+levels belong to the current release; `checks` takes any release.
 """
 
 from __future__ import annotations
