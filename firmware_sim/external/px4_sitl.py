@@ -184,9 +184,9 @@ EPOCH_US = constants.US_PER_S
 STATE_US = 200_000
 """Default interval of the true state [µs], unless PX4 requests another."""
 
-GPS_TICKS = 5
-"""Latency of a GPS fix [ticks]. PX4 stamps a fix with the previous sample's time, and subtracts
-EKF2_GPS_DELAY (10 ms in its simulators) and half a step of its filter (4 ms)."""
+GPS_TICKS = 4
+"""Latency of a GPS fix [ticks]. PX4 assumes 10 ms in its simulators (EKF2_GPS_DELAY), and stamps a
+fix with the time of the previous sample (4 ms)."""
 
 MAX_GARBAGE = 16
 """Maximum number of tolerated garbage runs; TCP should deliver none."""

@@ -211,8 +211,8 @@ def test_a_fix_arrives_as_late_as_px4_assumes(monkeypatch: pytest.MonkeyPatch) -
         flight.fly(2.0)
         fixes = [m.time_usec for m in flight.peer.heard if m.get_type() == "HIL_GPS"]
         assert len(fixes) > 5
-        # 10 ms, half a step of the filter and the stamp of the previous sample, in whole ticks.
-        assert {late - due for late, due in zip(fixes, measured, strict=False)} == {20_000}
+        # EKF2_GPS_DELAY, 10 ms, and the stamp of the previous sample, 4 ms, in whole ticks.
+        assert {late - due for late, due in zip(fixes, measured, strict=False)} == {16_000}
 
 
 def test_takeoff_hover_and_landing() -> None:
