@@ -34,8 +34,6 @@ from firmware_sim.mavlink.streams.status import hil_state_quaternion
 WATCH_S = 0.1
 """Maximum wait between checks that the other program is alive [wall s]."""
 
-CHUNK = 65_536
-
 _READ, _WRITE = select.POLLIN, select.POLLOUT
 
 
@@ -107,7 +105,7 @@ class TcpPort:
         for number, _ in self._poll.poll(timeout_s * constants.MS_PER_S):
             if number == connection.fileno():
                 try:
-                    return connection.recv(CHUNK) or None
+                    return connection.recv(65_536) or None
                 except BlockingIOError:
                     return b""
                 except OSError:
@@ -186,7 +184,9 @@ EPOCH_US = constants.US_PER_S
 STATE_US = 200_000
 """Default interval of the true state [µs], unless PX4 requests another."""
 
-NEVER_US = sys.maxsize
+GPS_TICKS = 4
+"""Latency of a GPS fix [ticks]. PX4 assumes 10 ms in its simulators (EKF2_GPS_DELAY), and stamps a
+fix with the time of the previous sample (4 ms)."""
 
 MAX_GARBAGE = 16
 """Maximum number of tolerated garbage runs; TCP should deliver none."""
@@ -260,6 +260,8 @@ class Px4Bridge:
         """PX4's process; None = not found."""
         self._garbage_bytes = 0
         """Number of bytes since the last message."""
+        self._fixes: list[interfaces.GpsFix | None] = [None] * GPS_TICKS
+        """GPS fixes of the newest samples, not yet sent."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Wait until PX4 has connected; see `Bridge`."""
@@ -323,10 +325,9 @@ class Px4Bridge:
 
     def _pace(self) -> None:
         """Wait for the next sample's wall time or PX4's first reply, to keep queues short."""
-        clock = self._clock
-        while (wait_us := self._pace_us - clock.time_us()) > 0 and self._answer is None:
+        while (wait_us := self._pace_us - self._clock.time_us()) > 0 and self._answer is None:
             self._receive(min(wait_us / constants.US_PER_S, WATCH_S))
-        now_us = clock.time_us()
+        now_us = self._clock.time_us()
         self._pace_us = now_us + constants.TICK_US
         self._alive()
         if now_us - self._began_us > self._start_s * constants.US_PER_S:
@@ -336,6 +337,8 @@ class Px4Bridge:
 
     def _send(self, sample: interfaces.SensorSample, now_us: int) -> None:
         encoder = self._encoder
+        self._fixes.append(sample.gps)
+        sample = sample._replace(gps=self._fixes.pop(0))
         # HIL_SENSOR goes last: it advances PX4's clock and triggers the reply.
         data = b""
         for name, kind, fields in _BESIDE_THE_SAMPLE:
@@ -403,17 +406,13 @@ class Px4Bridge:
         messages = self._decoder.feed(data)
         self._garbage_bytes = 0 if messages else self._garbage_bytes + len(data)
         for message in messages:
-            self._take(message)
+            if message.get_msgId() == _COMMAND:
+                self._command(message)
+            elif message.get_msgId() == _ANSWER:
+                self._take_answer(message)
         if self._garbage_bytes > MAX_GARBAGE_BYTES or self._decoder.malformed > MAX_GARBAGE:
             raise self._lost("sends bytes that are not MAVLink")
         return True
-
-    def _take(self, message: WireMessage) -> None:
-        number = message.get_msgId()
-        if number == _COMMAND:
-            self._command(message)
-        elif number == _ANSWER:
-            self._take_answer(message)
 
     def _take_answer(self, message: hil.Controls) -> None:
         time_us: int = message.time_usec
@@ -445,7 +444,7 @@ class Px4Bridge:
         asked = message.param2
         wanted_us = int(asked) if asked >= 1.0 else STATE_US
         self._state_us = max(wanted_us, self._least_state_us)
-        self._state_due_us = NEVER_US if asked < 0.0 else self._sent_us
+        self._state_due_us = sys.maxsize if asked < 0.0 else self._sent_us
 
     def _lost(self, what: str) -> interfaces.FirmwareLostError:
         notes = [f"{self._decoder.malformed} runs of garbage"] if self._decoder.malformed else []

@@ -197,6 +197,24 @@ def test_slower_sensors_come_at_their_own_rates_and_the_truth_as_asked() -> None
         assert states[-1].alt == pytest.approx(489_400, abs=200)
 
 
+def test_a_fix_arrives_as_late_as_px4_assumes(monkeypatch: pytest.MonkeyPatch) -> None:
+    with scene() as flight:
+        measured: list[int] = []
+        step = flight.bridge.step
+
+        def noted(sample: SensorSample) -> ActuatorControls:
+            if sample.gps is not None:
+                measured.append(sample.time_us - TICK_US + EPOCH_US)
+            return step(sample)
+
+        monkeypatch.setattr(flight.bridge, "step", noted)
+        flight.fly(2.0)
+        fixes = [m.time_usec for m in flight.peer.heard if m.get_type() == "HIL_GPS"]
+        assert len(fixes) > 5
+        # EKF2_GPS_DELAY, 10 ms, and the stamp of the previous sample, 4 ms, in whole ticks.
+        assert {late - due for late, due in zip(fixes, measured, strict=False)} == {16_000}
+
+
 def test_takeoff_hover_and_landing() -> None:
     with scene() as flight:
         client = Client(flight.peer.ports.api)
