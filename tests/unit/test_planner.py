@@ -23,6 +23,7 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.planner import (
     BLOCKED,
     CELLS,
+    CREEP_M_S,
     MOVES,
     OccupancyMap,
     PlannerPolicy,
@@ -258,7 +259,7 @@ def test_a_lost_obstacle_is_forgotten() -> None:
 def test_it_flies_straight_to_a_visible_goal() -> None:
     action = PlannerPolicy().act(look(arena(), (15.0, 0.0)))
     assert isinstance(action, Action)
-    assert action.forward_m_s == pytest.approx(S.max_speed_m_s, rel=0.02)
+    assert action.forward_m_s == pytest.approx(S.speeds_m_s[-1], rel=0.02)
     assert abs(action.right_m_s) < 0.1
     assert action.yaw_rate_rad_s == pytest.approx(0.0, abs=1e-9)
 
@@ -275,7 +276,7 @@ def test_it_passes_a_wall_on_the_shorter_side(side: float) -> None:
 def test_it_stays_within_its_speed_and_turns_to_a_goal_behind() -> None:
     policy = PlannerPolicy()
     action = policy.act(look(arena(), (-12.0, 2.0)))
-    assert math.hypot(action.forward_m_s, action.right_m_s) <= 0.25 * S.max_speed_m_s + 1e-9
+    assert math.hypot(action.forward_m_s, action.right_m_s) <= CREEP_M_S + 1e-9
     assert action.yaw_rate_rad_s == pytest.approx(S.max_yaw_rate_rad_s)
 
 
