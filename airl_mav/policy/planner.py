@@ -271,10 +271,8 @@ def follow(
         track.unseen_s += elapsed_s
     for first, last, whole in _groups(points, ranges):
         part = points[first:last]
-        width, evidence = (
-            float(np.hypot(*np.ptp(part, axis=0))),
-            known.evidence[known.cells_of(part)],
-        )
+        width = float(np.hypot(*np.ptp(part, axis=0)))
+        evidence = known.evidence[known.cells_of(part)]
         # The visible part of an obstacle in free space is enough: it came from elsewhere.
         if not whole and (evidence < 0.0).mean() < 0.5:
             continue
@@ -301,15 +299,9 @@ def _groups(points: Floats, ranges: Floats) -> list[tuple[int, int, bool]]:
     with np.errstate(invalid="ignore"):
         step = np.hypot(*np.diff(points, axis=0).T)
     borders = np.flatnonzero(np.pad(~(step < APART_M), 1, constant_values=True)).tolist()
+    before, after = beside[:-2] > ranges + BEHIND_M, beside[2:] > ranges + BEHIND_M
     return [
-        (
-            first,
-            last,
-            bool(
-                beside[first] > ranges[first] + BEHIND_M
-                and beside[last + 1] > ranges[last - 1] + BEHIND_M
-            ),
-        )
+        (first, last, bool(before[first] and after[last - 1]))
         for first, last in pairwise(borders)
         if np.isfinite(ranges[first])
     ]
@@ -380,7 +372,7 @@ class PlannerPolicy:
         velocity = to_world @ observation.velocity[:2]
         bearing = math.atan2(target[1] - position[1], target[0] - position[0])
         wishes = self._wishes(bearing, yaw, fov)
-        costs = self._costs(self._map, wishes, latency_s, position, velocity, goal, target, gap)
+        costs = self._costs(self._map, gap, wishes, latency_s, (position, velocity, goal, target))
         self._last = wishes[int(costs.min(axis=0).argmin())]
         turn = self._turn(bearing - yaw)
         # The velocity turns with the nose during the hold: aim so that the mean course is right.
@@ -414,9 +406,8 @@ class PlannerPolicy:
             return goal
         path = known.path(position, goal, gap, s)
         # Never the point next to the vehicle: it would stop there.
-        first = min(3, len(path) - 1)
-        best = path[first]
-        for point in path[first + 1 :: max(1, len(path) // 40)]:
+        best, *further = path[min(3, len(path) - 1) :]
+        for point in further[:: max(1, len(path) // 40)]:
             if float(np.hypot(*(point - position))) > SIGHT_M:
                 break
             if known.is_clear(gap, position, point, room_m):
@@ -437,20 +428,18 @@ class PlannerPolicy:
     def _costs(
         self,
         known: OccupancyMap,
+        gap: Floats,
         wishes: Floats,
         latency_s: float,
-        position: Floats,
-        velocity: Floats,
-        goal: Floats,
-        target: Floats,
-        gap: Floats,
+        points: tuple[Floats, Floats, Floats, Floats],
     ) -> Floats:
         """Return the costs (k, c) [s] of velocities (c, 2), for k times of straight flight.
 
         A cost is the time to the target, at the maximum speed from the end of the prediction, plus
         a charge for small gaps. A collision dominates it: later and shallower ones cost less.
+        `points` are position, velocity, goal and target (2,) north, east.
         """
-        s = self._settings
+        s, (position, velocity, goal, target) = self._settings, points
         movers = [track for track in self._tracks if track.moving]
         straight_on = np.array(STRAIGHT_ON_S)[:, None, None]
         shape = (len(STRAIGHT_ON_S), len(wishes))
@@ -462,9 +451,6 @@ class PlannerPolicy:
         cost, hit, there = np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
         # Too close already: only getting closer is a collision.
         least = min(s.margin_m, float(known.gap_at(gap, position)) - s.radius_m - 0.05)
-        rooms = [float(np.hypot(*(position - t.position))) - t.radius_m for t in movers]
-        least_moving = min([s.margin_m, *(room - s.radius_m - SPREAD_M - 0.05 for room in rooms)])
-        growth = GROWTH_M_S if least_moving == s.margin_m else 0.0
         for step in range(1, 1 + math.ceil((held_s + STRAIGHT_ON_S[-1] + BRAKING_S) / STEP_S)):
             t = step * STEP_S
             asked = self._last if t <= lead_s else np.where(t <= held_s + straight_on, wishes, 0.0)
@@ -476,11 +462,12 @@ class PlannerPolicy:
             moving = np.full(shape, np.inf)
             for track in movers:
                 off = at - (track.position + t * track.velocity)
-                size = track.radius_m + s.radius_m + SPREAD_M + growth * t
+                size = track.radius_m + s.radius_m + SPREAD_M + GROWTH_M_S * t
                 moving = np.minimum(moving, np.hypot(off[..., 0], off[..., 1]) - size)
-            depth = np.minimum(static - least, moving - least_moving)
+            depth = np.minimum(static - least, moving - s.margin_m)
             over = hit | there
-            now = (depth < 0.0) & ~over
+            # Before, nothing can be done: all candidates collide alike.
+            now = (depth < 0.0) & ~over & (t > lead_s)
             cost[now] = 1000.0 - 100.0 * t - 30.0 * np.maximum(depth[now], -3.0)
             hit |= now
             near = 2.0 * np.maximum(0.0, NEAR_M - moving) + np.maximum(0.0, CLOSE_M - static)
