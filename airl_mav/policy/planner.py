@@ -32,7 +32,10 @@ Cells = tuple[NDArray[np.int64], NDArray[np.int64]]
 class PlannerSettings:
     """Settings of the planner."""
 
-    max_speed_m_s: float = 5.0
+    speeds_m_s: tuple[float, ...] = (0.6, 1.25, 2.5, 3.75, 5.0, 6.5, 8.0)
+    """Speeds of the candidates, ascending."""
+    cautious_m_s: float = 6.6
+    """Maximum speed while moving obstacles are tracked."""
     max_yaw_rate_rad_s: float = math.radians(120.0)
     turn_gain_1_s: float = 2.0
     """Yaw rate per angle between nose and path."""
@@ -42,11 +45,11 @@ class PlannerSettings:
     """Minimum gap to obstacles."""
     comfort_m: float = 1.6
     """Distance to obstacles above which a path has no extra cost."""
-    dead_time_s: float = 0.27
+    dead_time_s: float = 0.23
     """Time from a setpoint to the vehicle's response; PX4 1.17 on the quad."""
-    response_s: float = 0.4
+    response_s: float = 0.54
     """Time constant of the velocity."""
-    brake_m_s2: float = 4.0
+    brake_m_s2: float = 6.0
     """Maximum acceleration in the prediction."""
     latency_s: float = 0.01
     """Decision latency if the observation has none."""
@@ -234,7 +237,7 @@ class Track:
         speed = float(np.hypot(*self.velocity))
         known_s = max(self.age_s + self.unseen_s, 1e-3)
         steady = 0.5 * speed < gone / known_s < 2.0 * speed
-        return self.age_s > 0.3 and speed > 0.7 and gone > 0.5 and steady
+        return self.age_s > 0.15 and speed > 0.7 and gone > 0.25 and steady
 
     def see(self, middle: Floats, radius_m: float, elapsed_s: float) -> None:
         """Update the track by the middle of an obstacle [m]."""
@@ -268,10 +271,8 @@ def follow(
         track.unseen_s += elapsed_s
     for first, last, whole in _groups(points, ranges):
         part = points[first:last]
-        width, evidence = (
-            float(np.hypot(*np.ptp(part, axis=0))),
-            known.evidence[known.cells_of(part)],
-        )
+        width = float(np.hypot(*np.ptp(part, axis=0)))
+        evidence = known.evidence[known.cells_of(part)]
         # The visible part of an obstacle in free space is enough: it came from elsewhere.
         if not whole and (evidence < 0.0).mean() < 0.5:
             continue
@@ -298,25 +299,19 @@ def _groups(points: Floats, ranges: Floats) -> list[tuple[int, int, bool]]:
     with np.errstate(invalid="ignore"):
         step = np.hypot(*np.diff(points, axis=0).T)
     borders = np.flatnonzero(np.pad(~(step < APART_M), 1, constant_values=True)).tolist()
+    before, after = beside[:-2] > ranges + BEHIND_M, beside[2:] > ranges + BEHIND_M
     return [
-        (
-            first,
-            last,
-            bool(
-                beside[first] > ranges[first] + BEHIND_M
-                and beside[last + 1] > ranges[last - 1] + BEHIND_M
-            ),
-        )
+        (first, last, bool(before[first] and after[last - 1]))
         for first, last in pairwise(borders)
         if np.isfinite(ranges[first])
     ]
 
 
-COURSES, SPEEDS = 32, (0.12, 0.25, 0.5, 0.75, 1.0)
-"""Candidates: courses, and speeds relative to the maximum."""
+COURSES = 32
+"""Courses of the candidates."""
 
-CREEP = 0.25
-"""Maximum relative speed out of the camera's view."""
+CREEP_M_S = 1.25
+"""Maximum speed out of the camera's view."""
 
 STEP_S = 0.15
 """Time step of the prediction [s]."""
@@ -373,11 +368,11 @@ class PlannerPolicy:
         gap = self._map.gaps(hits, s.comfort_m)
         target = self._target(self._map, position, goal, gap)
         told = observation.in_flight
-        lead_s = s.dead_time_s + (s.latency_s if told is None else float(told.latency_s))
+        latency_s = s.latency_s if told is None else float(told.latency_s)
         velocity = to_world @ observation.velocity[:2]
         bearing = math.atan2(target[1] - position[1], target[0] - position[0])
         wishes = self._wishes(bearing, yaw, fov)
-        costs = self._costs(self._map, wishes, lead_s, position, velocity, goal, target, gap)
+        costs = self._costs(self._map, gap, wishes, latency_s, (position, velocity, goal, target))
         self._last = wishes[int(costs.min(axis=0).argmin())]
         turn = self._turn(bearing - yaw)
         # The velocity turns with the nose during the hold: aim so that the mean course is right.
@@ -410,8 +405,9 @@ class PlannerPolicy:
         if known.is_clear(gap, position, goal, room_m):
             return goal
         path = known.path(position, goal, gap, s)
-        best = path[min(2, len(path) - 1)]
-        for point in path[:: max(1, len(path) // 40)]:
+        # Never the point next to the vehicle: it would stop there.
+        best, *further = path[min(3, len(path) - 1) :]
+        for point in further[:: max(1, len(path) // 40)]:
             if float(np.hypot(*(point - position))) > SIGHT_M:
                 break
             if known.is_clear(gap, position, point, room_m):
@@ -420,36 +416,38 @@ class PlannerPolicy:
 
     def _wishes(self, bearing: float, yaw: float, fov: float) -> Floats:
         """Return the candidate velocities (c, 2), north, east [m/s]."""
+        s = self._settings
         course = bearing + np.arange(COURSES) * (2.0 * math.pi / COURSES)
         off = np.abs(np.mod(course - yaw + math.pi, 2.0 * math.pi) - math.pi)
-        fan = self._settings.max_speed_m_s * np.stack([np.cos(course), np.sin(course)], axis=1)
-        seen = [fan if share <= CREEP else fan[off < 0.5 * fov] for share in SPEEDS]
-        moves = [share * each for share, each in zip(SPEEDS, seen, strict=True)]
+        fan = np.stack([np.cos(course), np.sin(course)], axis=1)
+        moving = any(track.moving for track in self._tracks)
+        speeds = [v for v in s.speeds_m_s if v <= s.cautious_m_s or not moving]
+        moves = [v * (fan if v <= CREEP_M_S else fan[off < 0.5 * fov]) for v in speeds]
         return np.concatenate([np.zeros((1, 2)), *moves])
 
     def _costs(
         self,
         known: OccupancyMap,
-        wishes: Floats,
-        lead_s: float,
-        position: Floats,
-        velocity: Floats,
-        goal: Floats,
-        target: Floats,
         gap: Floats,
+        wishes: Floats,
+        latency_s: float,
+        points: tuple[Floats, Floats, Floats, Floats],
     ) -> Floats:
         """Return the costs (k, c) [s] of velocities (c, 2), for k times of straight flight.
 
         A cost is the time to the target, at the maximum speed from the end of the prediction, plus
         a charge for small gaps. A collision dominates it: later and shallower ones cost less.
+        `points` are position, velocity, goal and target (2,) north, east.
         """
-        s = self._settings
+        s, (position, velocity, goal, target) = self._settings, points
         movers = [track for track in self._tracks if track.moving]
         straight_on = np.array(STRAIGHT_ON_S)[:, None, None]
         shape = (len(STRAIGHT_ON_S), len(wishes))
         at, going = np.broadcast_to(position, (*shape, 2)), np.broadcast_to(velocity, (*shape, 2))
         share = 1.0 - math.exp(-STEP_S / s.response_s)
-        held_s = lead_s + s.period_s
+        lead_s = s.dead_time_s + latency_s
+        # The next setpoint follows after the hold and another latency.
+        held_s = lead_s + s.period_s + latency_s
         cost, hit, there = np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
         # Too close already: only getting closer is a collision.
         least = min(s.margin_m, float(known.gap_at(gap, position)) - s.radius_m - 0.05)
@@ -468,13 +466,14 @@ class PlannerPolicy:
                 moving = np.minimum(moving, np.hypot(off[..., 0], off[..., 1]) - size)
             depth = np.minimum(static - least, moving - s.margin_m)
             over = hit | there
-            now = (depth < 0.0) & ~over
+            # Before, nothing can be done: all candidates collide alike.
+            now = (depth < 0.0) & ~over & (t > lead_s)
             cost[now] = 1000.0 - 100.0 * t - 30.0 * np.maximum(depth[now], -3.0)
             hit |= now
             near = 2.0 * np.maximum(0.0, NEAR_M - moving) + np.maximum(0.0, CLOSE_M - static)
             cost += np.where(over | now, 0.0, STEP_S * (1.0 + near))
             there |= np.hypot(*np.moveaxis(at - goal, -1, 0)) < ARRIVED_M
-        left = np.hypot(*np.moveaxis(at - target, -1, 0)) / s.max_speed_m_s
+        left = np.hypot(*np.moveaxis(at - target, -1, 0)) / s.speeds_m_s[-1]
         return np.asarray(np.where(hit | there, cost, cost + left))
 
 

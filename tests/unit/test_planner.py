@@ -23,6 +23,7 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.planner import (
     BLOCKED,
     CELLS,
+    CREEP_M_S,
     MOVES,
     OccupancyMap,
     PlannerPolicy,
@@ -258,7 +259,7 @@ def test_a_lost_obstacle_is_forgotten() -> None:
 def test_it_flies_straight_to_a_visible_goal() -> None:
     action = PlannerPolicy().act(look(arena(), (15.0, 0.0)))
     assert isinstance(action, Action)
-    assert action.forward_m_s == pytest.approx(S.max_speed_m_s, rel=0.02)
+    assert action.forward_m_s == pytest.approx(S.speeds_m_s[-1], rel=0.02)
     assert abs(action.right_m_s) < 0.1
     assert action.yaw_rate_rad_s == pytest.approx(0.0, abs=1e-9)
 
@@ -275,8 +276,42 @@ def test_it_passes_a_wall_on_the_shorter_side(side: float) -> None:
 def test_it_stays_within_its_speed_and_turns_to_a_goal_behind() -> None:
     policy = PlannerPolicy()
     action = policy.act(look(arena(), (-12.0, 2.0)))
-    assert math.hypot(action.forward_m_s, action.right_m_s) <= 0.25 * S.max_speed_m_s + 1e-9
+    assert math.hypot(action.forward_m_s, action.right_m_s) <= CREEP_M_S + 1e-9
     assert action.yaw_rate_rad_s == pytest.approx(S.max_yaw_rate_rad_s)
+
+
+def test_it_pursues_a_point_of_the_path_ahead_even_without_sight_of_it() -> None:
+    known, policy = new_map(), PlannerPolicy()
+    known.evidence[:] = 0.0
+    rows, columns = known.cells_of(np.array([[2.0, -9.0], [2.0, 9.0]]))
+    known.evidence[rows[0], columns[0] : columns[1]] = 5.0
+    gap = known.gaps(NO_HITS, S.comfort_m)
+    target = policy._target(known, np.zeros(2), np.array([30.0, 0.0]), gap)
+    assert np.hypot(*target) > 1.5
+
+
+def mover(north: float, east: float, speed: float) -> Track:
+    """An obstacle of 0.5 m that approaches the origin from the north, tracked for a second."""
+    at, going = np.array([north, east]), np.array([-speed, 0.0])
+    return Track(at, at - going, 0.5, going, 1.0)
+
+
+def test_it_is_slower_where_obstacles_move() -> None:
+    policy = PlannerPolicy()
+    fast = np.hypot(*policy._wishes(0.0, 0.0, FOV).T).max()
+    policy._tracks = [mover(12.0, 5.0, 2.0)]
+    slow = np.hypot(*policy._wishes(0.0, 0.0, FOV).T).max()
+    assert (fast, slow) == pytest.approx((8.0, 6.5))
+
+
+def test_too_close_to_a_moving_obstacle_it_leaves() -> None:
+    known, policy = new_map(), PlannerPolicy()
+    policy._tracks = [mover(0.9, 0.0, 1.0)]
+    gap = known.gaps(NO_HITS, S.comfort_m)
+    wishes = policy._wishes(0.0, 0.0, FOV)
+    still, goal = np.zeros(2), np.array([30.0, 0.0])
+    costs = policy._costs(known, gap, wishes, 0.01, (still, still, goal, goal)).min(axis=0)
+    assert costs[wishes[:, 0] > 1.0].min() > costs[wishes[:, 0] < 0.0].min()
 
 
 # --- flights
