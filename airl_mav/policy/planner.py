@@ -151,11 +151,8 @@ class OccupancyMap:
         return bool((found >= min(room_m, found[0])).all())
 
     def path(self, position: Floats, goal: Floats, gap: Floats, s: PlannerSettings) -> Floats:
-        """Return the path of least cost to the goal (n, 2) [m]. Raises UsageError without scipy."""
-        try:
-            from scipy.sparse import csgraph, csr_matrix
-        except ImportError:
-            raise UsageError("policy planner: needs scipy; pip install scipy") from None
+        """Return the path of least cost to the goal (n, 2) [m]."""
+        csgraph, csr_matrix = _search()
         half = CELLS // 2
         # A node is two by two cells: the largest gap counts, so that a narrow door stays open.
         wide = gap.reshape(half, 2, half, 2).max(axis=(1, 3))
@@ -248,10 +245,6 @@ class Track:
         self.velocity = self.velocity + gain * error / elapsed_s
         self.radius_m = max(radius_m, 0.98 * self.radius_m)
 
-    def stand(self) -> None:
-        """Start again as a static obstacle."""
-        self.born, self.velocity, self.age_s = self.position, np.zeros(2), 0.0
-
 
 def follow(
     tracks: list[Track], known: OccupancyMap, points: Floats, ranges: Floats, elapsed_s: float
@@ -287,7 +280,7 @@ def follow(
         kept.append(found)
         found.see(middle, 0.5 * width, elapsed_s)
         if (evidence >= SURE).mean() > 0.5:
-            found.stand()
+            found.born, found.velocity, found.age_s = found.position, np.zeros(2), 0.0
         moving[first:last] = found.moving
     lost = [track for track in free if track.unseen_s < (1.5 if track.moving else 0.3)]
     return kept + lost, moving
@@ -332,11 +325,21 @@ ARRIVED_M = 2.5
 """Distance from the goal at which a prediction ends [m]."""
 
 
+def _search() -> tuple[Any, Any]:
+    """Return scipy's `csgraph` and `csr_matrix`. Raises UsageError without scipy."""
+    try:
+        from scipy.sparse import csgraph, csr_matrix
+    except ImportError:
+        raise UsageError("policy planner: needs scipy; pip install scipy") from None
+    return csgraph, csr_matrix
+
+
 class PlannerPolicy:
     """Path planning on a map of the depth images. Implements `actions.Policy`."""
 
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self._settings = settings or PlannerSettings()
+        _search()  # No decision in flight waits for the import.
         self._map: OccupancyMap | None = None
         self._tracks: list[Track] = []
         self._time_us: int | None = None
@@ -352,8 +355,7 @@ class PlannerPolicy:
         to_world = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         position = np.asarray(state.position[:2], np.float64)
         goal = position + to_world @ observation.goal
-        if self._map is None:
-            self._map = OccupancyMap(position, goal)
+        self._map = self._map or OccupancyMap(position, goal)
         # A bearing is wider than any column, so that a wall leaves none empty.
         ranges = scan(near_points(observation, s.band_m), fov, int(fov * lens.focal / 1.1))
         angle = yaw + (np.arange(len(ranges)) + 0.5) * (fov / len(ranges)) - 0.5 * fov

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -201,10 +202,19 @@ def test_no_path_leads_through_a_wall_one_cell_thick() -> None:
 
 def test_without_scipy_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "scipy.sparse", None)
-    known = new_map()
-    gap = known.gaps(NO_HITS, S.comfort_m)
     with pytest.raises(UsageError, match="needs scipy"):
-        known.path(np.zeros(2), np.array([20.0, 0.0]), gap, S)
+        PlannerPolicy()
+
+
+def test_it_loads_its_path_search_before_the_flight() -> None:
+    program = """
+import sys
+from airl_mav.policy.registry import load_policy
+assert "scipy.sparse" not in sys.modules
+load_policy("planner", 0.1)
+assert "scipy.sparse.csgraph" in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 # --- tracks
