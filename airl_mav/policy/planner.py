@@ -32,10 +32,8 @@ Cells = tuple[NDArray[np.int64], NDArray[np.int64]]
 class PlannerSettings:
     """Settings of the planner."""
 
-    speeds_m_s: tuple[float, ...] = (0.6, 1.25, 2.5, 3.75, 5.0, 6.5, 8.0)
+    speeds_m_s: tuple[float, ...] = (0.6, 1.25, 2.5, 3.75, 5.0)
     """Speeds of the candidates, ascending."""
-    cautious_m_s: float = 6.6
-    """Maximum speed while moving obstacles are tracked."""
     max_yaw_rate_rad_s: float = math.radians(120.0)
     turn_gain_1_s: float = 2.0
     """Yaw rate per angle between nose and path."""
@@ -418,13 +416,11 @@ class PlannerPolicy:
 
     def _wishes(self, bearing: float, yaw: float, fov: float) -> Floats:
         """Return the candidate velocities (c, 2), north, east [m/s]."""
-        s = self._settings
         course = bearing + np.arange(COURSES) * (2.0 * math.pi / COURSES)
         off = np.abs(np.mod(course - yaw + math.pi, 2.0 * math.pi) - math.pi)
         fan = np.stack([np.cos(course), np.sin(course)], axis=1)
-        moving = any(track.moving for track in self._tracks)
-        speeds = [v for v in s.speeds_m_s if v <= s.cautious_m_s or not moving]
-        moves = [v * (fan if v <= CREEP_M_S else fan[off < 0.5 * fov]) for v in speeds]
+        speeds, seen = self._settings.speeds_m_s, fan[off < 0.5 * fov]
+        moves = [v * (fan if v <= CREEP_M_S else seen) for v in speeds]
         return np.concatenate([np.zeros((1, 2)), *moves])
 
     def _costs(

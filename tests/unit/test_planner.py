@@ -306,14 +306,6 @@ def mover(north: float, east: float, speed: float) -> Track:
     return Track(at, at - going, 0.5, going, 1.0)
 
 
-def test_it_is_slower_where_obstacles_move() -> None:
-    policy = PlannerPolicy()
-    fast = np.hypot(*policy._wishes(0.0, 0.0, FOV).T).max()
-    policy._tracks = [mover(12.0, 5.0, 2.0)]
-    slow = np.hypot(*policy._wishes(0.0, 0.0, FOV).T).max()
-    assert (fast, slow) == pytest.approx((8.0, 6.5))
-
-
 def test_too_close_to_a_moving_obstacle_it_leaves() -> None:
     known, policy = new_map(), PlannerPolicy()
     policy._tracks = [mover(0.9, 0.0, 1.0)]
