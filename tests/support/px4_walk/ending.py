@@ -47,10 +47,11 @@ FAILURES = (
         "set SYS_FAILURE_EN 1",
         lambda v: v.plugin(Param).set_param_int("SYS_FAILURE_EN", 1),
     ),
+    # Without GPS or battery, a failsafe ends the flight within a second.
     *_failures("SENSOR_GPS", kinds=("OK",)),
+    *_failures("SYSTEM_BATTERY", kinds=("OK",)),
     *_failures("SENSOR_MAG"),
     *_failures("SENSOR_BARO"),
-    *_failures("SYSTEM_BATTERY"),
     *_failures("SYSTEM_RC_SIGNAL", "TIMEOUT"),
     *_failures("SYSTEM_MAVLINK_SIGNAL", "TIMEOUT"),
     Row("failure", "hold after the failures", lambda v: action(v).hold()),
