@@ -464,7 +464,7 @@ class PlannerPolicy:
                 moving = np.minimum(moving, np.hypot(off[..., 0], off[..., 1]) - size)
             depth = np.minimum(static - least, moving - s.margin_m)
             over = hit | there
-            # Before, nothing can be done: all candidates collide alike.
+            # Until the vehicle responds, all candidates are alike.
             now = (depth < 0.0) & ~over & (t > lead_s)
             cost[now] = 1000.0 - 100.0 * t - 30.0 * np.maximum(depth[now], -3.0)
             hit |= now

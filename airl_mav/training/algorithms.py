@@ -197,8 +197,9 @@ def further_images(observation_space: spaces.Dict) -> list[str]:
     return sorted(key for key in found if key != main)
 
 
-def policy_arguments(spec: NetworkSpec = NetworkSpec()) -> dict[str, Any]:  # noqa: B008 (frozen)
+def policy_arguments(spec: NetworkSpec | None = None) -> dict[str, Any]:
     """Return the `policy_kwargs` of a MultiInputPolicy; FieldError for a missing extractor."""
+    spec = spec or NetworkSpec()
     extractor: Any = ImageExtractor
     if spec.own:
         extractor = load_part(NETWORKS, spec.kind, _is_extractor)

@@ -184,6 +184,8 @@ EPOCH_US = constants.US_PER_S
 STATE_US = 200_000
 """Default interval of the true state [µs], unless PX4 requests another."""
 
+NEVER_US = sys.maxsize
+
 GPS_TICKS = 4
 """Latency of a GPS fix [ticks]. PX4 assumes 10 ms in its simulators (EKF2_GPS_DELAY), and stamps a
 fix with the time of the previous sample (4 ms)."""
@@ -338,7 +340,8 @@ class Px4Bridge:
     def _send(self, sample: interfaces.SensorSample, now_us: int) -> None:
         encoder = self._encoder
         self._fixes.append(sample.gps)
-        sample = sample._replace(gps=self._fixes.pop(0))
+        if (fix := self._fixes.pop(0)) is not sample.gps:
+            sample = sample._replace(gps=fix)
         # HIL_SENSOR goes last: it advances PX4's clock and triggers the reply.
         data = b""
         for name, kind, fields in _BESIDE_THE_SAMPLE:
@@ -444,7 +447,7 @@ class Px4Bridge:
         asked = message.param2
         wanted_us = int(asked) if asked >= 1.0 else STATE_US
         self._state_us = max(wanted_us, self._least_state_us)
-        self._state_due_us = sys.maxsize if asked < 0.0 else self._sent_us
+        self._state_due_us = NEVER_US if asked < 0.0 else self._sent_us
 
     def _lost(self, what: str) -> interfaces.FirmwareLostError:
         notes = [f"{self._decoder.malformed} runs of garbage"] if self._decoder.malformed else []
