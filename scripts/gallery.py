@@ -85,8 +85,7 @@ def vehicles() -> list[Entry]:
         )
         pictures = {f"vehicle-{name}.png": partial(draw_by_command, view)}
         description = loading.describe_profile("vehicles", name)
-        check = f"airl vehicle {name}"
-        entries.append(Entry(name, description, facts, (check, view), pictures))
+        entries.append(Entry(name, description, facts, (view,), pictures))
     return entries
 
 

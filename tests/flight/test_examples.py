@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from airl_mav.addons.airframe_check.airframe_check import check_airframe
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.flight.judge import Outcome
@@ -211,12 +210,6 @@ def test_sb3_model(tmp_path: Path) -> None:
     text = output_of("sb3_model.py", tmp_path)
     assert (tmp_path / "my-policy/card.json").is_file()
     assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2
-
-
-def test_the_7_inch_quad_has_fitting_gains() -> None:
-    figures = check_airframe(str(EXAMPLES / "quad-7-inch.toml"))
-    assert figures.warnings == ()
-    assert figures.thrust_to_weight == pytest.approx(4.97, abs=0.01)
 
 
 def test_the_workflow_passes_with_a_shipped_policy(tmp_path: Path) -> None:

@@ -779,7 +779,8 @@ def raw(name: str, data: Content) -> Build:
 
 
 def profiles() -> Iterator[tuple[str, tuple[str, ...], Build]]:
-    arena, vehicle = ("arena", "{d}/mine.toml"), ("vehicle", "{d}/mine.toml")
+    arena = ("arena", "{d}/mine.toml")
+    vehicle = ("parameters", "px4", "--vehicle", "{d}/mine.toml")
     for target in (OUTSIDE / "secret", ZERO, FIFO, "folder", "loop", "sparse"):
         yield (
             f"arena: file is {Path(str(target)).name}",
@@ -840,16 +841,6 @@ def profiles() -> Iterator[tuple[str, tuple[str, ...], Build]]:
         "description": f'"{ESCAPES!a}"'.replace("'", "").replace("\\x", "\\u00"),
     }.items():
         yield f"vehicle: {key}", vehicle, toml("vehicles", "quad", **{key: value})
-    for what, data in {
-        "bomb": lambda: b"a,b\n" * 2_000_000,
-        "NUL": b"\0" * 999,
-        "numbers": "thrust,power\n1e999,nan\n",
-    }.items():
-        yield (
-            f"vehicle: motor table is {what}",
-            ("vehicle", "quad", "--motor-data", "{d}/t.csv"),
-            raw("t.csv", data),
-        )
     for what, data in {
         "letters": "x\n" * 99,
         "30 million numbers": lambda: b"1\n" * 30_000_000,
