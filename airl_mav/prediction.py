@@ -277,7 +277,7 @@ class Compensator:
         self._dead_us = round(self._response.dead_time_s * US_PER_S)
         self._mount = _Mount(vehicle.camera)
         self._reprojector = Reprojector(vehicle.camera, intrinsics)
-        self.memory = DecisionMemory(n)
+        self.memory = DecisionMemory(n, foresees=True)
         """Setpoints and latencies so far."""
         shape = (intrinsics.height, intrinsics.width)
         self._depth_mm = np.zeros((n, remembered, *shape), np.uint16)
@@ -449,8 +449,9 @@ class _Mount:
 class DecisionMemory:
     """Decisions of n companions."""
 
-    def __init__(self, n: int) -> None:
-        """Take the number of companions."""
+    def __init__(self, n: int, *, foresees: bool = False) -> None:
+        """Take the number of companions, and whether their observations are compensated."""
+        self.foresees = foresees
         self.latency = ExpectedLatency(n)
         """Expected t2."""
         self.newest = np.zeros((n, 4))
@@ -474,6 +475,7 @@ class DecisionMemory:
             self.latency.expected_us() / US_PER_S,
             age_us / US_PER_S,
             self.newest,
+            self.foresees,
         )
 
     def held(self) -> Mapping[str, Any]:

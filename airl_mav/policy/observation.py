@@ -58,6 +58,8 @@ class InFlight:
     setpoint: Vector
     """(..., 4) newest setpoint: `actions.BodyRates`, `actions.Attitude`, or a velocity forward,
     right, down [m/s] and a yaw rate [rad/s]; zeros before the first."""
+    foreseen: bool = False
+    """True if the observation is compensated: of the time at which the setpoint arrives."""
 
     @property
     def command(self) -> Vector:
@@ -72,7 +74,9 @@ class InFlight:
     def rows(self, index: Rows) -> InFlight:
         """Return the state of one or several of n companions."""
         latency_s, age_s = np.asarray(self.latency_s), np.asarray(self.age_s)
-        return InFlight(latency_s[index], age_s[index], self.setpoint[index])
+        return replace(
+            self, latency_s=latency_s[index], age_s=age_s[index], setpoint=self.setpoint[index]
+        )
 
 
 @dataclass(frozen=True)

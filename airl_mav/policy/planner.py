@@ -10,9 +10,11 @@ Fox, Burgard, Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +58,17 @@ class PlannerSettings:
     band_m: float = 0.5
     """Returns within this height above or below the vehicle are obstacles."""
 
+    @property
+    def limits(self) -> tuple[float, float, float]:
+        """Maximum command: forward, right [m/s], yaw rate [rad/s]."""
+        return self.speeds_m_s[-1], self.speeds_m_s[-1], self.max_yaw_rate_rad_s
+
+
+LEARNED = PlannerSettings(speeds_m_s=(0.6, 1.25, 2.5, 3.75, 5.0, 6.0, 7.0))
+"""Settings of the candidates that a network scores."""
+
+WORST_S = 20.0
+"""Upper bound of a candidate's cost, relative to the best one's [s]."""
 
 CELLS = 160
 """Cells along a map's side; an even number."""
@@ -91,9 +104,6 @@ class OccupancyMap:
         self.cell = side / CELLS
         self.origin = 0.5 * (position + goal - side)
         self.evidence = np.zeros((CELLS, CELLS))
-        middles = (np.arange(CELLS) + 0.5) * self.cell
-        self._north = (self.origin[0] + middles)[:, None]
-        self._east = (self.origin[1] + middles)[None, :]
         self._graph: Any = None
 
     def cells_of(self, points: Floats) -> Cells:
@@ -103,15 +113,11 @@ class OccupancyMap:
 
     def look(self, position: Floats, yaw: float, fov: float, ranges: Floats, hits: Floats) -> None:
         """Update the evidence by a scan: ranges (b,) [m] over the view, hits (n, 2) [m]."""
-        north, east = self._north - position[0], self._east - position[1]
-        angle = np.mod(np.arctan2(east, north) - yaw + 0.5 * fov, 2.0 * math.pi)
-        bearing = np.minimum((angle * (len(ranges) / fov)).astype(np.int64), len(ranges))
         # A cell is as wide as a bearing in some distance: its neighbours must be free, too.
         padded = np.pad(np.minimum(ranges, FREE_M), 1)
         least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-        limit = np.append(least - 0.9 * self.cell, 0.0)
-        free = np.hypot(north, east) < limit[bearing]
-        self.evidence[free] = np.maximum(LEAST, self.evidence[free] - 1.0)
+        place, per_rad, limit = (self.origin, self.cell), len(ranges) / fov, least - 0.9 * self.cell
+        _kernels().see_free(self.evidence, *place, position, yaw - 0.5 * fov, per_rad, limit, LEAST)
         hit = self.cells_of(hits)
         self.evidence[hit] = np.minimum(MOST, self.evidence[hit] + 1.0)
 
@@ -124,22 +130,8 @@ class OccupancyMap:
         reach = math.ceil(reach_m / self.cell)
         square = np.where(self.evidence > 0.0, 0.0, (reach + 1.0) ** 2)
         square[self.cells_of(hits)] = 0.0
-        for turned in (square, square.T):
-            before = turned.copy()
-            for k in range(1, reach + 1):
-                np.minimum(turned[k:], before[:-k] + k * k, out=turned[k:])
-                np.minimum(turned[:-k], before[k:] + k * k, out=turned[:-k])
+        _kernels().fill_gaps(square, reach)
         return np.sqrt(square) * self.cell
-
-    def gap_at(self, gap: Floats, at: Floats) -> Floats:
-        """Return the gaps at positions (..., 2), interpolated."""
-        index = np.clip((at - self.origin) / self.cell - 0.5, 0.0, CELLS - 1.001)
-        low = index.astype(np.int64)
-        u, v = np.moveaxis(index - low, -1, 0)
-        flat, k = gap.ravel(), low[..., 0] * CELLS + low[..., 1]
-        near = (1.0 - v) * flat[k] + v * flat[k + 1]
-        far = (1.0 - v) * flat[k + CELLS] + v * flat[k + CELLS + 1]
-        return np.asarray((1.0 - u) * near + u * far)
 
     def is_clear(self, gap: Floats, start: Floats, end: Floats, room_m: float) -> bool:
         """Return True if the gap along a line is at least `room_m`, or its start's gap."""
@@ -234,6 +226,11 @@ class Track:
         steady = 0.5 * speed < gone / known_s < 2.0 * speed
         return self.age_s > 0.15 and speed > 0.7 and gone > 0.25 and steady
 
+    @property
+    def possible(self) -> bool:
+        """True if it may move, but is not known to."""
+        return not self.moving and self.age_s > 0.05 and 0.4 < np.hypot(*self.velocity) < 6.0
+
     def see(self, middle: Floats, radius_m: float, elapsed_s: float) -> None:
         """Update the track by the middle of an obstacle [m]."""
         self.age_s, self.unseen_s = self.age_s + elapsed_s, 0.0
@@ -301,26 +298,17 @@ def _groups(points: Floats, ranges: Floats) -> list[tuple[int, int, bool]]:
 COURSES = 32
 """Courses of the candidates."""
 
+BLIND_M = 1.0
+"""Maximum distance flown during a decision [m]."""
+
+DRIFT_M_S = 0.5
+"""Growth of the minimum gap with the latency [m/s]."""
+
 CREEP_M_S = 1.25
 """Maximum speed out of the camera's view."""
 
-STEP_S = 0.15
-"""Time step of the prediction [s]."""
-
-STRAIGHT_ON_S = (0.0, 0.6, 1.5)
+STRAIGHT_ON_S = np.array([0.0, 0.6, 1.5])
 """Times of straight flight before the vehicle brakes in the prediction [s]."""
-
-BRAKING_S = 1.2
-"""Time of braking in the prediction [s]."""
-
-SPREAD_M, GROWTH_M_S = 0.25, 0.25
-"""Uncertainty of a moving obstacle's size [m], and its growth with the prediction [m/s]."""
-
-NEAR_M, CLOSE_M = 1.5, 0.8
-"""Gaps to moving and static obstacles below which a prediction costs more [m]."""
-
-ARRIVED_M = 2.5
-"""Distance from the goal at which a prediction ends [m]."""
 
 
 def _search() -> tuple[Any, Any]:
@@ -332,12 +320,74 @@ def _search() -> tuple[Any, Any]:
     return csgraph, csr_matrix
 
 
+@cache
+def _kernels() -> Any:
+    """Return the compiled functions, ready to run; imported late, as numba takes a second."""
+    from airl_mav.policy import planner_kernels
+
+    planner_kernels.warm_up()
+    return planner_kernels
+
+
+class Places(NamedTuple):
+    """Positions of a decision and the velocity, each (2,) north, east [m, m/s]."""
+
+    position: Floats
+    velocity: Floats
+    goal: Floats
+    target: Floats
+    """Pursued point of the path."""
+
+
+class Hold(NamedTuple):
+    """Timing of a setpoint, from the observation on."""
+
+    lead_s: float
+    """Time until the vehicle responds to it; the previous one is active before."""
+    held_s: float
+    """Time until it responds to the next."""
+    turn: float
+    """Yaw rate of the setpoint [rad/s]."""
+    last_turn: float
+    """Yaw rate of the previous one [rad/s]."""
+
+
+class Candidates(NamedTuple):
+    """Candidate velocities of a decision."""
+
+    velocities: Floats
+    """(c, 2) north, east [m/s]."""
+    commands: Floats
+    """(c, 3) forward, right [m/s], yaw rate [rad/s]."""
+    costs: Floats
+    """(c,) costs of the planner [s]."""
+    features: Floats
+    """(c, FEATURES) inputs of a network."""
+
+
+OUTCOME_FEATURES, OWN_FEATURES = 8, 14
+FEATURES = len(STRAIGHT_ON_S) * OUTCOME_FEATURES + OWN_FEATURES
+"""Features of a candidate: of its predictions, and its own."""
+
+MOST_COST_S = 6.0
+"""Upper bound of the cost of a prediction among the features [s]."""
+
+
+def candidate_count(speeds: Sequence[float], fov: float) -> int:
+    """Return the maximum number of candidates for a horizontal field of view [rad]."""
+    creeps = sum(speed <= CREEP_M_S for speed in speeds)
+    seen = min(COURSES, int(COURSES * fov / (2.0 * math.pi)) + 1)
+    return 1 + COURSES * creeps + seen * (len(speeds) - creeps)
+
+
 class PlannerPolicy:
     """Path planning on a map of the depth images. Implements `actions.Policy`."""
 
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self._settings = settings or PlannerSettings()
-        _search()  # No decision in flight waits for the import.
+        # No decision in flight waits for an import or a compilation.
+        _search()
+        _kernels()
         self._map: OccupancyMap | None = None
         self._tracks: list[Track] = []
         self._time_us: int | None = None
@@ -348,9 +398,26 @@ class PlannerPolicy:
 
     def act(self, observation: Observation) -> Action:
         """Return the velocity for an observation."""
+        found = self.candidates(observation)
+        best = int(found.costs.argmin())
+        self._last = found.velocities[best]
+        return Action(*found.commands[best].tolist())
+
+    def candidates(self, observation: Observation, *, features: bool = False) -> Candidates:
+        """Return the candidates for an observation; without `features` they have none."""
         s, state, yaw = self._settings, observation.states[0], float(observation.yaw)
         lens, fov = observation.intrinsics, observation.intrinsics.horizontal_fov_rad
         to_world = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        told = observation.in_flight
+        latency_s = s.latency_s if told is None else float(told.latency_s)
+        # The next setpoint follows after the hold and another latency.
+        held_s = s.period_s + latency_s
+        ahead_s, nose = latency_s, yaw
+        if told is not None:
+            self._last = to_world @ told.command[:2]
+            # A compensated observation is of the time at which the setpoint arrives.
+            ahead_s *= not told.foreseen
+            nose += ahead_s * float(told.command[2])
         position = np.asarray(state.position[:2], np.float64)
         goal = position + to_world @ observation.goal
         self._map = self._map or OccupancyMap(position, goal)
@@ -361,42 +428,45 @@ class PlannerPolicy:
         points = np.full((len(ranges), 2), np.inf)
         ray = np.stack([np.cos(angle[seen]), np.sin(angle[seen])], axis=1)
         points[seen] = position + ranges[seen, None] * ray
-        elapsed_s = self._elapsed(state.time_us)
+        elapsed_s = self._elapsed(state.time_us, s.period_s if told is None else held_s)
         self._tracks, moving = follow(self._tracks, self._map, points, ranges, elapsed_s)
         hits = points[seen & ~moving]
         self._map.look(position, yaw, fov, ranges, hits)
         gap = self._map.gaps(hits, s.comfort_m)
         target = self._target(self._map, position, goal, gap)
-        told = observation.in_flight
-        latency_s = s.latency_s if told is None else float(told.latency_s)
         velocity = to_world @ observation.velocity[:2]
         bearing = math.atan2(target[1] - position[1], target[0] - position[0])
-        wishes = self._wishes(bearing, yaw, fov)
-        costs = self._costs(self._map, gap, wishes, latency_s, (position, velocity, goal, target))
-        self._last = wishes[int(costs.min(axis=0).argmin())]
-        turn = self._turn(bearing - yaw)
+        wishes = self._wishes(bearing, yaw, fov, latency_s)
+        places = Places(position, velocity, goal, target)
+        turn = self._turn(bearing - nose, held_s)
+        hold = Hold(s.dead_time_s + ahead_s, held_s, turn, 0.0 if told is None else told.command[2])
+        outcomes = self._outcomes(self._map, gap, wishes, hold, places)
         # The velocity turns with the nose during the hold: aim so that the mean course is right.
-        mean = yaw + 0.5 * turn * s.period_s
-        north, east = float(self._last[0]), float(self._last[1])
-        c, d = math.cos(mean), math.sin(mean)
-        return Action(c * north + d * east, c * east - d * north, turn)
+        mean = nose + 0.5 * turn * held_s
+        c, d, (north, east) = math.cos(mean), math.sin(mean), wishes.T
+        commands = [c * north + d * east, c * east - d * north, np.full(len(wishes), turn)]
+        numbers = np.zeros((len(wishes), 0))
+        if features:
+            numbers = self._features(wishes, outcomes, latency_s, places, np.array([bearing, yaw]))
+        return Candidates(wishes, np.stack(commands, axis=1), outcomes[0].min(axis=0), numbers)
 
-    def _elapsed(self, time_us: int | None) -> float:
-        """Return the time since the previous decision [s]."""
+    def _elapsed(self, time_us: int | None, cycle_s: float) -> float:
+        """Return the time since the previous decision [s]; without timestamps `cycle_s`."""
         before, self._time_us = self._time_us, time_us
         if time_us is None or before is None:
-            return self._settings.period_s
+            return cycle_s
         return min(1.0, max(1e-3, (time_us - before) / US_PER_S))
 
-    def _turn(self, angle: float) -> float:
-        """Return the yaw rate [rad/s] for an angle between nose and path."""
+    def _turn(self, angle: float, held_s: float) -> float:
+        """Return the yaw rate [rad/s] for an angle between nose and path and a hold [s]."""
         angle = math.atan2(math.sin(angle), math.cos(angle))
         if abs(angle) > math.radians(150.0):
             angle = self._side * abs(angle)
         else:
             self._side = math.copysign(1.0, angle)
         limit = self._settings.max_yaw_rate_rad_s
-        return max(-limit, min(limit, self._settings.turn_gain_1_s * angle))
+        gain = min(self._settings.turn_gain_1_s, 1.0 / held_s)
+        return max(-limit, min(limit, gain * angle))
 
     def _target(self, known: OccupancyMap, position: Floats, goal: Floats, gap: Floats) -> Floats:
         """Return the pursued point: the most distant one of the path in line of sight."""
@@ -414,65 +484,87 @@ class PlannerPolicy:
                 best = point
         return np.asarray(best)
 
-    def _wishes(self, bearing: float, yaw: float, fov: float) -> Floats:
+    def _wishes(self, bearing: float, yaw: float, fov: float, latency_s: float) -> Floats:
         """Return the candidate velocities (c, 2), north, east [m/s]."""
         course = bearing + np.arange(COURSES) * (2.0 * math.pi / COURSES)
         off = np.abs(np.mod(course - yaw + math.pi, 2.0 * math.pi) - math.pi)
         fan = np.stack([np.cos(course), np.sin(course)], axis=1)
-        speeds, seen = self._settings.speeds_m_s, fan[off < 0.5 * fov]
+        seen = fan[off < 0.5 * fov]
+        speeds = [v for v in self._settings.speeds_m_s if v * latency_s < BLIND_M or v <= CREEP_M_S]
         moves = [v * (fan if v <= CREEP_M_S else seen) for v in speeds]
         return np.concatenate([np.zeros((1, 2)), *moves])
 
-    def _costs(
-        self,
-        known: OccupancyMap,
-        gap: Floats,
-        wishes: Floats,
-        latency_s: float,
-        points: tuple[Floats, Floats, Floats, Floats],
+    def _outcomes(
+        self, known: OccupancyMap, gap: Floats, wishes: Floats, hold: Hold, places: Places
     ) -> Floats:
-        """Return the costs (k, c) [s] of velocities (c, 2), for k times of straight flight.
+        """Return the outcomes (8, k, c) of velocities (c, 2), for k times of straight flight.
 
         A cost is the time to the target, at the maximum speed from the end of the prediction, plus
         a charge for small gaps. A collision dominates it: later and shallower ones cost less.
-        `points` are position, velocity, goal and target (2,) north, east.
         """
-        s, (position, velocity, goal, target) = self._settings, points
-        movers = [track for track in self._tracks if track.moving]
-        straight_on = np.array(STRAIGHT_ON_S)[:, None, None]
-        shape = (len(STRAIGHT_ON_S), len(wishes))
-        at, going = np.broadcast_to(position, (*shape, 2)), np.broadcast_to(velocity, (*shape, 2))
-        share = 1.0 - math.exp(-STEP_S / s.response_s)
-        lead_s = s.dead_time_s + latency_s
-        # The next setpoint follows after the hold and another latency.
-        held_s = lead_s + s.period_s + latency_s
-        cost, hit, there = np.zeros(shape), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-        # Too close already: only getting closer is a collision.
-        least = min(s.margin_m, float(known.gap_at(gap, position)) - s.radius_m - 0.05)
-        for step in range(1, 1 + math.ceil((held_s + STRAIGHT_ON_S[-1] + BRAKING_S) / STEP_S)):
-            t = step * STEP_S
-            asked = self._last if t <= lead_s else np.where(t <= held_s + straight_on, wishes, 0.0)
-            change = (asked - going) * share
-            most = s.brake_m_s2 * STEP_S / np.maximum(np.hypot(*np.moveaxis(change, -1, 0)), 1e-9)
-            going = going + change * np.minimum(1.0, most)[..., None]
-            at = at + STEP_S * going
-            static = known.gap_at(gap, at) - s.radius_m
-            moving = np.full(shape, np.inf)
-            for track in movers:
-                off = at - (track.position + t * track.velocity)
-                size = track.radius_m + s.radius_m + SPREAD_M + GROWTH_M_S * t
-                moving = np.minimum(moving, np.hypot(off[..., 0], off[..., 1]) - size)
-            depth = np.minimum(static - least, moving - s.margin_m)
-            over = hit | there
-            # Until the vehicle responds, all candidates are alike.
-            now = (depth < 0.0) & ~over & (t > lead_s)
-            cost[now] = 1000.0 - 100.0 * t - 30.0 * np.maximum(depth[now], -3.0)
-            hit |= now
-            near = 2.0 * np.maximum(0.0, NEAR_M - moving) + np.maximum(0.0, CLOSE_M - static)
-            cost += np.where(over | now, 0.0, STEP_S * (1.0 + near))
-            there |= np.hypot(*np.moveaxis(at - goal, -1, 0)) < ARRIVED_M
-        left = np.hypot(*np.moveaxis(at - target, -1, 0)) / s.speeds_m_s[-1]
-        return np.asarray(np.where(hit | there, cost, cost + left))
+        s = self._settings
+        found = np.empty((8, len(STRAIGHT_ON_S), len(wishes)))
+        # The longer the reaction, the less certain is the position.
+        margin_m = s.margin_m + DRIFT_M_S * (hold.held_s - s.period_s)
+        body = (s.radius_m, margin_m, s.response_s, s.brake_m_s2, s.speeds_m_s[-1])
+        _kernels().predict(
+            *(gap, known.evidence, known.origin, known.cell),
+            *(_rows(track for track in self._tracks if getattr(track, kind)) for kind in KINDS),
+            *(wishes, STRAIGHT_ON_S, np.array(places), self._last),
+            *(np.array([*hold, s.dead_time_s]), np.array(body), found),
+        )
+        return found
+
+    def _features(
+        self, wishes: Floats, found: Floats, latency_s: float, places: Places, course: Floats
+    ) -> Floats:
+        """Return the features (c, FEATURES) of velocities (c, 2), each about -1 to 2.
+
+        `course` are the bearing of the target and the heading [rad].
+        """
+        cost, hit_s, flown, left, unknown, static_m, moving_m, possible_m = found
+        hit = np.isfinite(hit_s)
+        predicted = [
+            hit,
+            np.where(hit, 1.0 - hit_s / 4.0, 0.0),
+            *(static_m, moving_m / 1.5, possible_m / 1.5),
+            *(unknown, left, np.minimum(flown, MOST_COST_S) / 3.0),
+        ]
+        speed = np.hypot(wishes[:, 0], wishes[:, 1])
+        turn = np.arctan2(wishes[:, 1], wishes[:, 0])[:, None] - course
+        going = speed > 0.0
+        velocity, best = places.velocity, cost.min(axis=0)
+        movers = sum(track.moving for track in self._tracks)
+        possible = sum(track.possible for track in self._tracks)
+        own: list[Any] = [
+            speed / 5.0,
+            np.cos(turn[:, 0]) * going,
+            np.cos(turn[:, 1]) * going,
+            np.abs(np.sin(turn[:, 1])) * going,
+            np.hypot(*(wishes - self._last).T) / 5.0,
+            np.hypot(*(wishes - velocity).T) / 5.0,
+            math.hypot(*velocity) / 5.0,
+            math.cos(course[0] - course[1]),
+            min(math.hypot(*(places.goal - places.position)), 20.0) / 20.0,
+            latency_s,
+            movers / 4.0,
+            possible / 4.0,
+            np.minimum(best - best.min(), 10.0) / 5.0,
+            min(float(best.min()), 20.0) / 10.0,
+        ]
+        columns = [row for each in zip(*predicted, strict=True) for row in each]
+        columns += [np.broadcast_to(each, len(wishes)) for each in own]
+        return np.stack(columns, axis=1)
+
+
+KINDS = "moving", "possible"
+"""Kinds of tracks in a prediction."""
+
+
+def _rows(tracks: Iterable[Track]) -> Floats:
+    """Return position, velocity and radius (m, 5) of tracks."""
+    rows = [(*track.position, *track.velocity, track.radius_m) for track in tracks]
+    return np.array(rows, np.float64).reshape(-1, 5)
 
 
 def scan(points: Floats, fov: float, bearings: int) -> Floats:

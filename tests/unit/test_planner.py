@@ -6,6 +6,7 @@ import heapq
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, signal
 
 from airl_mav import Scenario, rehearse
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
+from airl_mav.policy import planner_kernels as kernels
 from airl_mav.policy.actions import Action
+from airl_mav.policy.observation import InFlight
 from airl_mav.policy.planner import (
     BLOCKED,
     CELLS,
     CREEP_M_S,
+    LEARNED,
     MOVES,
+    OUTCOME_FEATURES,
+    STRAIGHT_ON_S,
+    Hold,
     OccupancyMap,
+    Places,
     PlannerPolicy,
     PlannerSettings,
     Track,
@@ -306,14 +314,84 @@ def mover(north: float, east: float, speed: float) -> Track:
     return Track(at, at - going, 0.5, going, 1.0)
 
 
-def test_too_close_to_a_moving_obstacle_it_leaves() -> None:
-    known, policy = new_map(), PlannerPolicy()
-    policy._tracks = [mover(0.9, 0.0, 1.0)]
+def predicted(
+    policy: PlannerPolicy, wishes: Floats, hold: Hold, target: tuple[float, float] = (30.0, 0.0)
+) -> Floats:
+    """Outcomes (8, k, c) in open space, from a hover."""
+    known, goal = new_map(), np.array(target)
     gap = known.gaps(NO_HITS, S.comfort_m)
-    wishes = policy._wishes(0.0, 0.0, FOV)
-    still, goal = np.zeros(2), np.array([30.0, 0.0])
-    costs = policy._costs(known, gap, wishes, 0.01, (still, still, goal, goal)).min(axis=0)
+    still = np.zeros(2)
+    return policy._outcomes(known, gap, wishes, hold, Places(still, still, goal, goal))
+
+
+QUICK = Hold(S.dead_time_s + 0.01, 0.11, 0.0, 0.0)
+
+
+def test_too_close_to_a_moving_obstacle_it_leaves() -> None:
+    policy = PlannerPolicy()
+    policy._tracks = [mover(0.9, 0.0, 1.0)]
+    wishes = policy._wishes(0.0, 0.0, FOV, 0.01)
+    costs = predicted(policy, wishes, QUICK)[kernels.COST].min(axis=0)
     assert costs[wishes[:, 0] > 1.0].min() > costs[wishes[:, 0] < 0.0].min()
+
+
+@pytest.mark.parametrize("speed", [0.6, 2.5])
+def test_a_prediction_is_a_first_order_response(speed: float) -> None:
+    found = predicted(PlannerPolicy(), np.array([[speed, 0.0]]), QUICK)
+    t = kernels.STEP_S * np.arange(1, 100)
+    for k, straight_on in enumerate(STRAIGHT_ON_S):
+        end = QUICK.lead_s + QUICK.held_s + straight_on
+        asked = np.where((t > QUICK.lead_s) & (t <= end), speed, 0.0)
+        left = math.exp(-kernels.STEP_S / S.response_s)
+        steps = math.ceil((QUICK.lead_s + QUICK.held_s + 1.5 + kernels.BRAKING_S) / kernels.STEP_S)
+        going = signal.lfilter([1.0 - left], [1.0, -left], asked)[:steps]
+        away = 30.0 - kernels.STEP_S * going.sum()
+        assert found[kernels.LEFT, k, 0] * S.speeds_m_s[-1] == pytest.approx(away, abs=1e-9)
+
+
+def test_a_setpoint_turns_with_the_nose() -> None:
+    """A setpoint of 2 s that turns by 1 rad flies an arc about its mean course."""
+    turning, straight = (
+        predicted(PlannerPolicy(), np.array([[2.0, 0.0]]), Hold(0.23, 2.0, rate, 0.0))
+        for rate in (0.5, 0.0)
+    )
+    # Chord over arc of 1 rad.
+    chord = 2.0 * math.sin(0.5)
+    away = 30.0 - S.speeds_m_s[-1] * np.array([turning, straight])[:, kernels.LEFT, 0, 0]
+    assert away[0] == pytest.approx(chord * away[1], rel=0.03)
+    assert away[0] < 0.99 * away[1]
+
+
+def test_a_collision_with_a_moving_obstacle_has_its_time() -> None:
+    policy = PlannerPolicy()
+    policy._tracks = [mover(5.0, 0.0, 2.0)]
+    hit_s = predicted(policy, np.zeros((1, 2)), QUICK)[kernels.HIT_S]
+    # (5 - 2 t) m are left of 0.5 + 0.3 + 0.25 + 0.25 t + 0.2.
+    assert hit_s == pytest.approx(3.75 / 2.25, abs=kernels.STEP_S)
+    policy._tracks = []
+    assert np.isinf(predicted(policy, np.zeros((1, 2)), QUICK)[kernels.HIT_S]).all()
+
+
+def test_late_decisions_fly_slowly() -> None:
+    wishes = PlannerPolicy(LEARNED)._wishes(0.0, 0.0, FOV, 0.396)
+    assert np.hypot(*wishes.T).max() == pytest.approx(2.5)
+    wishes = PlannerPolicy(LEARNED)._wishes(0.0, 0.0, FOV, 0.1)
+    assert np.hypot(*wishes.T).max() == pytest.approx(7.0)
+
+
+def test_it_knows_the_setpoint_in_flight() -> None:
+    """A compensated observation is of the time at which the setpoint arrives."""
+    seen = look(arena(), (20.0, 0.0))
+    told = InFlight(np.array(0.4), np.array(0.0), np.array([0.0, 2.0, 0.0, 0.0]))
+    reached = []
+    for foreseen in (True, False):
+        policy = PlannerPolicy(LEARNED)
+        in_flight = replace(told, foreseen=foreseen)
+        found = policy.candidates(replace(seen, in_flight=in_flight), features=True)
+        np.testing.assert_allclose(policy._last, [0.0, 2.0])
+        reached.append(found.features[0, OUTCOME_FEATURES - 2])
+    # Without compensation it flies to the side for another 0.4 s.
+    assert reached[1] > reached[0]
 
 
 # --- flights

@@ -1,0 +1,205 @@
+"""Compiled predictions of the planner."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.kernels import kernel
+
+Floats = NDArray[np.float64]
+
+STEP_S = 0.15
+"""Time step of the prediction [s]."""
+
+BRAKING_S = 1.2
+"""Time of braking in the prediction [s]."""
+
+SPREAD_M, GROWTH_M_S = 0.25, 0.25
+"""Uncertainty of a moving obstacle's size [m], and its growth with the prediction [m/s]."""
+
+NEAR_M, CLOSE_M = 1.5, 0.8
+"""Gaps to moving and static obstacles below which a prediction costs more [m]."""
+
+ARRIVED_M = 2.5
+"""Distance from the goal at which a prediction ends [m]."""
+
+COST, HIT_S, FLOWN, LEFT, UNKNOWN, STATIC_M, MOVING_M, POSSIBLE_M = range(8)
+"""Outcomes of a prediction: cost [s]; time to the collision, infinite = none [s]; cost before
+`LEFT`, the time from its end to the target [s]; share of the way in unknown cells; minimum gaps to
+static, moving and possibly moving obstacles [m]."""
+
+
+@kernel
+def gap_at(gap: Floats, origin: Floats, cell: float, north: float, east: float) -> float:
+    """Return the gap at a position, interpolated on the map (rows, columns)."""
+    rows, columns = gap.shape
+    x = min(max((north - origin[0]) / cell - 0.5, 0.0), rows - 1.001)
+    y = min(max((east - origin[1]) / cell - 0.5, 0.0), columns - 1.001)
+    row, column = int(x), int(y)
+    u, v = x - row, y - column
+    near = (1.0 - v) * gap[row, column] + v * gap[row, column + 1]
+    far = (1.0 - v) * gap[row + 1, column] + v * gap[row + 1, column + 1]
+    found: float = (1.0 - u) * near + u * far
+    return found
+
+
+@kernel
+def _gap_to(tracks: Floats, north: float, east: float, t: float, radius: float) -> float:
+    """Return the gap to moving obstacles (m, 5) in t [s]: position, velocity, radius."""
+    found = math.inf
+    for k in range(len(tracks)):
+        x = north - tracks[k, 0] - t * tracks[k, 2]
+        y = east - tracks[k, 1] - t * tracks[k, 3]
+        size = tracks[k, 4] + radius + SPREAD_M + GROWTH_M_S * t
+        found = min(found, math.sqrt(x * x + y * y) - size)
+    return found
+
+
+@kernel
+def predict(
+    gap: Floats,
+    evidence: Floats,
+    origin: Floats,
+    cell: float,
+    tracks: Floats,
+    possible: Floats,
+    wishes: Floats,
+    straight_on: Floats,
+    places: Floats,
+    last: Floats,
+    hold: Floats,
+    body: Floats,
+    found: Floats,
+) -> None:
+    """Predict velocities, each held, then straight on for a while, then braked to a stop.
+
+    Args:
+        gap: (rows, columns) distances to static obstacles [m].
+        evidence: (rows, columns) of the map; 0 = unknown.
+        origin: North, east of the map's corner [m].
+        cell: Side of a cell [m].
+        tracks: (m, 5) moving obstacles: position, velocity, radius.
+        possible: The same of those that may move.
+        wishes: (c, 2) velocities, north, east [m/s].
+        straight_on: (k,) times of straight flight [s].
+        places: (4, 2) position, velocity, goal, target.
+        last: (2,) previous velocity.
+        hold: Lead and hold [s], yaw rate and previous yaw rate [rad/s], dead time [s].
+        body: Radius, margin [m], time constant of the velocity [s], acceleration [m/s2], speed to
+            the target [m/s].
+        found: (8, k, c) outcomes, written.
+    """
+    radius, margin, response_s, most_m_s2, speed = body[0], body[1], body[2], body[3], body[4]
+    lead, end = hold[0], hold[0] + hold[1]
+    share = 1.0 - math.exp(-STEP_S / response_s)
+    steps = math.ceil((end + straight_on[-1] + BRAKING_S) / STEP_S)
+    # Too close already: only getting closer is a collision.
+    here = gap_at(gap, origin, cell, places[0, 0], places[0, 1])
+    least = min(margin, here - radius - 0.05)
+    for k in range(len(straight_on)):
+        for c in range(len(wishes)):
+            x, y, vx, vy = places[0, 0], places[0, 1], places[1, 0], places[1, 1]
+            cost, hit_s, unknown, flown = 0.0, math.inf, 0, 0
+            gaps = (2.0, 3.0, 3.0)
+            there = False
+            for step in range(1, steps + 1):
+                t = step * STEP_S
+                # Setpoints turn with the nose.
+                north, east, angle = 0.0, 0.0, 0.0
+                if t <= lead:
+                    north, east, angle = last[0], last[1], hold[3] * (t - hold[4])
+                elif t <= end + straight_on[k]:
+                    north, east = wishes[c, 0], wishes[c, 1]
+                    angle = hold[2] * (min(t, end) - 0.5 * (lead + end))
+                cos, sin = math.cos(angle), math.sin(angle)
+                ax = (cos * north - sin * east - vx) * share
+                ay = (sin * north + cos * east - vy) * share
+                most = most_m_s2 * STEP_S / max(math.sqrt(ax * ax + ay * ay), 1e-9)
+                vx, vy = vx + min(1.0, most) * ax, vy + min(1.0, most) * ay
+                x, y = x + STEP_S * vx, y + STEP_S * vy
+                if there:
+                    continue
+                static = gap_at(gap, origin, cell, x, y) - radius
+                moving = _gap_to(tracks, x, y, t, radius)
+                maybe = _gap_to(possible, x, y, t, radius)
+                gaps = (min(gaps[0], static), min(gaps[1], moving), min(gaps[2], maybe))
+                row = min(max(int((x - origin[0]) / cell), 0), len(evidence) - 1)
+                column = min(max(int((y - origin[1]) / cell), 0), len(evidence) - 1)
+                unknown, flown = unknown + (evidence[row, column] == 0.0), flown + 1
+                depth = min(static - least, moving - margin)
+                # Until the vehicle responds, all candidates are alike.
+                if depth < 0.0 and t > lead:
+                    cost, hit_s = 1000.0 - 100.0 * t - 30.0 * max(depth, -3.0), t
+                    there = True
+                    continue
+                near = 2.0 * max(0.0, NEAR_M - moving) + max(0.0, CLOSE_M - static)
+                cost += STEP_S * (1.0 + near)
+                there = math.hypot(x - places[2, 0], y - places[2, 1]) < ARRIVED_M
+            left = math.hypot(x - places[3, 0], y - places[3, 1]) / speed
+            found[COST, k, c] = cost if there else cost + left
+            found[HIT_S, k, c], found[FLOWN, k, c], found[LEFT, k, c] = hit_s, cost, left
+            found[UNKNOWN, k, c] = unknown / max(flown, 1)
+            found[STATIC_M, k, c], found[MOVING_M, k, c], found[POSSIBLE_M, k, c] = gaps
+
+
+@kernel
+def fill_gaps(square: Floats, reach: int) -> None:
+    """Replace squares (n, n) by the least square plus squared distance in cells, up to `reach`."""
+    n = len(square)
+    before = np.empty(n)
+    for axis in range(2):
+        for i in range(n):
+            for j in range(n):
+                before[j] = square[j, i] if axis == 0 else square[i, j]
+            for j in range(n):
+                least = before[j]
+                for k in range(1, reach + 1):
+                    if j >= k:
+                        least = min(least, before[j - k] + k * k)
+                    if j + k < n:
+                        least = min(least, before[j + k] + k * k)
+                if axis == 0:
+                    square[j, i] = least
+                else:
+                    square[i, j] = least
+
+
+@kernel
+def see_free(
+    evidence: Floats,
+    origin: Floats,
+    cell: float,
+    position: Floats,
+    first: float,
+    per_rad: float,
+    limit: Floats,
+    lowest: float,
+) -> None:
+    """Lower the evidence of cells in front of the returns.
+
+    `limit` (b,) are the free ranges of bearings from `first` [rad] on, `per_rad` in a radian.
+    """
+    furthest = limit.max()
+    for row in range(len(evidence)):
+        north = origin[0] + (row + 0.5) * cell - position[0]
+        for column in range(len(evidence)):
+            east = origin[1] + (column + 0.5) * cell - position[1]
+            away = math.sqrt(north * north + east * east)
+            if away >= furthest:
+                continue
+            bearing = int(((math.atan2(east, north) - first) % (2.0 * math.pi)) * per_rad)
+            if bearing < len(limit) and away < limit[bearing]:
+                evidence[row, column] = max(lowest, evidence[row, column] - 1.0)
+
+
+def warm_up() -> None:
+    """Compile all functions, or load them from the cache."""
+    square, pair, none = np.zeros((4, 4)), np.zeros(2), np.zeros((0, 5))
+    fill_gaps(square, 1)
+    see_free(square, pair, 1.0, pair, 0.0, 1.0, np.ones(1), 0.0)
+    still, tables = np.zeros((1, 2)), (square, square, pair, 1.0, none, none)
+    hold, body, found = np.zeros(5), np.ones(5), np.zeros((8, 1, 1))
+    predict(*tables, still, np.zeros(1), np.zeros((4, 2)), pair, hold, body, found)
