@@ -24,7 +24,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 from airl_mav.policy.actions import Action, Policy, command_numbers, commands, failure_of, flyable
-from airl_mav.policy.layouts import Encoded, encode_layout
+from airl_mav.policy.layouts import Encoded, boxes, encode_layout, layout_of
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.registry import LearnedPolicy
 
@@ -86,8 +86,11 @@ class LearnedPilots:
         self._chance = chance
         # Random actions must be independent of other rows, and memory must be bit-identical to the
         # companion's, which a batch of n rows does not guarantee.
-        self._alone = bool(policy.card.epsilon or policy.card.state)
+        self._remembers = layout_of(policy.card.observation.layout).remembers
+        self._alone = bool(policy.card.epsilon or policy.card.state or self._remembers)
         self._own: dict[int, LearnedPolicy] = {}
+        self.encoded: Encoded = {}
+        """Inputs of the last `decide`."""
         self.failed: dict[int, str] = {}
 
     def begin(self, slot: int, seed: int) -> None:
@@ -98,7 +101,7 @@ class LearnedPilots:
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the commands; see `Pilots`."""
         card = self._policy.card
-        encoded = encode_layout(card.observation, seen)
+        encoded = self.encoded = self._encode(seen, flying)
         self.failed = {}
         if not self._alone:
             with suppress(Exception):  # Of some rows, which are found below.
@@ -116,6 +119,19 @@ class LearnedPilots:
         chosen = np.zeros((len(flying), command_numbers(card.actions)))
         self.failed = _each(flying, act, chosen)
         return chosen
+
+    def _encode(self, seen: Observation, flying: NDArray[np.bool_]) -> Encoded:
+        """Return the inputs of n vehicles; with a memory zeros for those that do not fly."""
+        if not self._remembers:
+            return self._policy.encode(seen)
+        found = {
+            key: np.zeros((len(flying), *box.shape), box.dtype)
+            for key, box in boxes(self._policy.card.observation).items()
+        }
+        for i in np.flatnonzero(flying).tolist():
+            for key, array in self._own[i].encode(seen.rows([i])).items():
+                found[key][i] = array[0]
+        return found
 
 
 def _each(

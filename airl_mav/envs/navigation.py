@@ -48,7 +48,7 @@ from airl_mav.faults import Fault, check_gym
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import UPRIGHT_S
 from airl_mav.policy.images import Bytes, body_bytes
-from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, encode_layout
+from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded, encode_layout, layout_of
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.prediction import Compensator
@@ -344,6 +344,9 @@ class Navigation(Stateful):
         encoded, self._encoded = self._encoded, None
         if encoded is not None and slots is None:
             return encoded
+        if layout_of(self.observation.layout).remembers:
+            layout = self.observation.layout
+            raise FieldError("layout", layout, "body, paper, scan or your own, without a memory")
         return encode_layout(self.observation, self.see(slots), COMPILED)
 
     def kinematics(self, rows: Rows = EVERYONE) -> Kinematics:

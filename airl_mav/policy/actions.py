@@ -4,7 +4,8 @@ An action is a velocity, or an attitude or body rates with a thrust.
 
 Action sets: `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's
 text. `velocity`: the paper's continuous pair, forward and right speed, the nose turns to the
-course; `velocity-fixed-yaw`: the same pair with a fixed heading. Sets of three dimensions also
+course; `velocity-fixed-yaw`: the same pair with a fixed heading; `velocity-yaw-rate`: the same pair
+and a yaw rate. Sets of three dimensions also
 command the vertical speed; the other sets hold an altitude. `velocity3d` and `velocity3d-fixed-yaw`
 are these two with a third number, and `arc3d-75` is `arc-25` climbing, level and sinking.
 `body-rates` commands no velocity: three body rates and a collective thrust. Any other name is a
@@ -271,6 +272,10 @@ FOLLOW_MAX_RAD_S = math.radians(90.0)
 """`velocity`: maximum yaw rate [rad/s]."""
 
 
+MAX_YAW_RATE_RAD_S = math.radians(120.0)
+"""`velocity-yaw-rate`: maximum yaw rate [rad/s]."""
+
+
 MAX_RATE_DEG_S = 180.0
 """`body-rates`: maximum rate [deg/s]; PX4's defaults are 220 deg/s for roll and pitch, and 200
 deg/s for yaw (MC_ROLLRATE_MAX, MC_PITCHRATE_MAX, MC_YAWRATE_MAX)."""
@@ -330,8 +335,11 @@ class DiscreteSet(ActionSet):
 class VelocitySet(ActionSet):
     """Continuous velocities, clipped; without a fixed heading the nose turns to the course."""
 
-    def __init__(self, *, vertical: bool = False, fixed_yaw: bool = False) -> None:
-        self.vertical, self.numbers, self._fixed_yaw = vertical, 2 + vertical, fixed_yaw
+    def __init__(
+        self, *, vertical: bool = False, fixed_yaw: bool = False, yaw_rate: bool = False
+    ) -> None:
+        self.vertical, self.numbers, self._fixed_yaw = vertical, 2 + vertical + yaw_rate, fixed_yaw
+        self._yaw_rate = yaw_rate
 
     def commands(self, spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
         """Return the velocities of n shares of the maximum."""
@@ -340,6 +348,8 @@ class VelocitySet(ActionSet):
         # Limit the vector's length: a corner of the square is no faster than an edge.
         speed = np.hypot(wanted[:, 0], wanted[:, 1])
         wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
+        if self._yaw_rate:
+            return np.concatenate([wanted, shares[:, 2:] * MAX_YAW_RATE_RAD_S], axis=1)
         down = shares[:, 2:] * fastest_climb(spec.max_speed_m_s)
         if self._fixed_yaw:
             return np.concatenate([wanted, np.zeros((len(wanted), 1)), down], axis=1)
@@ -417,6 +427,7 @@ ACTION_SETS: dict[str, ActionSet] = {
     "arc3d-75": DiscreteSet(75, _arc_3d, vertical=True),
     "velocity3d": VelocitySet(vertical=True),
     "velocity3d-fixed-yaw": VelocitySet(vertical=True, fixed_yaw=True),
+    "velocity-yaw-rate": VelocitySet(yaw_rate=True),
     BODY_RATES: BodyRateSet(),
 }
 """Shipped action sets by name."""
@@ -480,7 +491,8 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
 
     Discrete actions are (n,) integers from 0 on. Continuous actions are (n, 2): forward and right
     speed, each -1..1 of the maximum, clipped. Sets of three dimensions are (n, 3). The third number
-    is the downward speed as a share of `actions.fastest_climb`. `body-rates` is (n, 4): roll, pitch
+    is the downward speed as a share of `actions.fastest_climb`; of `velocity-yaw-rate` the yaw rate
+    as a share of `MAX_YAW_RATE_RAD_S`. `body-rates` is (n, 4): roll, pitch
     and yaw rate, each -1..1 of the maximum, and thrust, -1 for zero to 1 for full thrust.
 
     The commands are (n, 3): forward and right [m/s] in the heading frame, and yaw rate [rad/s],

@@ -3,10 +3,11 @@
 `body` is the default: the camera's image, and goal and velocity in the heading frame. `paper` is
 Air Learning's own input as in its code: a 154 x 256 image whose top rows draw the bearing of the
 goal, and vectors in the world frame. `scan` is `body` with a level scan, as from a planar lidar, in
-place of the depth image. Earlier scans are moved to the vehicle's present position. All are Dicts
+place of the depth image. Earlier scans are moved to the vehicle's present position. These are Dicts
 of the image, `velocity` and `goal`. The image's key is the camera's kind: `depth`, `rgb` or `grey`.
-Images of additional cameras follow, under KIND_NAME. Any other layout is a custom class,
-constructed without arguments, with the methods `boxes` and `encode` of `Layout`.
+Images of additional cameras follow, under KIND_NAME. `candidates` is the planner's: velocities with
+features of their predicted flight. Its map is the memory of a flight. Any other layout is a custom
+class, constructed without arguments, with the methods `boxes` and `encode` of `Layout`.
 
 To add an input, add a row to `INPUTS`. To add a layout, add an object to `LAYOUTS`.
 
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import down_in_body, heading_to_ned
+from airl_mav.policy import planner
 from airl_mav.policy.images import (
     NUMPY,
     Bytes,
@@ -47,6 +49,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Encoded = dict[str, NDArray[Any]]
 """Arrays of a layout, by key."""
+
+Encoder = Callable[..., Encoded]
+"""Function as `Layout.encode`."""
 
 VELOCITY, GOAL = "velocity", "goal"
 """Keys of the shipped layouts besides the image's key, which is the camera's kind."""
@@ -188,6 +193,8 @@ class Layout:
     """Fields of the specification with a fixed value: value, and accepted values as text."""
     looks_ahead = False
     """True if the middle of the image must be ahead."""
+    remembers = False
+    """True if an encoder depends on earlier observations: each flight needs its own."""
 
     def problem(self, spec: ObservationSpec) -> str | None:
         """Return why the layout does not support a specification, or None if it does."""
@@ -247,6 +254,10 @@ class Layout:
             told = [INPUTS[name].encode(seen) for name in spec.in_flight]
             encoded[IN_FLIGHT] = np.concatenate(told, axis=1).astype(np.float32)
         return encoded | dict(_further(spec, seen, shrink))
+
+    def encoder(self) -> Encoder:
+        """Return the function of `encode` for the observations of a flight, in order."""
+        return self.encode
 
     def image(self, spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[np.uint8]:
         """Return the network's images of n vehicles, the newest frame first."""
@@ -350,6 +361,56 @@ class ScanLayout(Layout):
         return spec.width_px // SEAM_SHARE if whole else 0
 
 
+class CandidatesLayout(Layout):
+    """Layout `candidates`: the planner's candidates for a network that scores them."""
+
+    only: Mapping[str, tuple[Any, str]] = {
+        "kind": ("depth", "'depth'"),
+        "frames": (1, "1"),
+        "goal_height": (False, "false"),
+        "in_flight": (("command", "latency"), "command, latency"),
+        "cameras": ({}, "none"),
+    }
+    looks_ahead = remembers = True
+
+    def boxes(self, spec: ObservationSpec) -> dict[str, Box]:
+        """Return the arrays by key: features, planner's costs and commands of c candidates."""
+        fov = math.radians(spec.horizontal_fov_deg)
+        count = planner.candidate_count(planner.LEARNED.speeds_m_s, fov)
+        shapes = {
+            "candidates": (count, planner.FEATURES),
+            "commands": (count, 3),
+            "costs": (count,),
+        }
+        return {key: Box(shape, np.float32, -math.inf, math.inf) for key, shape in shapes.items()}
+
+    def encode(self, spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
+        """Return the arrays of first decisions."""
+        rows = [self.encoder()(spec, seen.rows([i]), shrink) for i in range(len(seen.goal))]
+        return {key: np.concatenate([row[key] for row in rows]) for key in self.boxes(spec)}
+
+    def encoder(self) -> Encoder:
+        """Return the encoder of one flight."""
+        memory = planner.PlannerPolicy(planner.LEARNED)
+
+        def encode(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:  # noqa: ARG001
+            boxes = self.boxes(spec)
+            found = memory.candidates(seen.rows(0), features=True)
+            told = {
+                "candidates": found.features,
+                "commands": found.commands / planner.LEARNED.limits,
+                "costs": np.minimum(found.costs - found.costs.min(), planner.WORST_S),
+            }
+            encoded = {key: np.zeros((1, *box.shape), np.float32) for key, box in boxes.items()}
+            # Candidates out of view are missing.
+            encoded["costs"][:] = 2.0 * planner.WORST_S
+            for key, array in told.items():
+                encoded[key][0, : len(array)] = array
+            return encoded
+
+        return encode
+
+
 class CustomLayout(Layout):
     """Layout of a custom class. Its rules are checked without loading its code."""
 
@@ -397,7 +458,12 @@ class CustomLayout(Layout):
         return encoded
 
 
-LAYOUTS: dict[str, Layout] = {"body": Layout(), "paper": PaperLayout(), "scan": ScanLayout()}
+LAYOUTS: dict[str, Layout] = {
+    "body": Layout(),
+    "paper": PaperLayout(),
+    "scan": ScanLayout(),
+    "candidates": CandidatesLayout(),
+}
 """Shipped layouts by name."""
 
 SHIPPED = tuple(LAYOUTS)
@@ -438,6 +504,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         its level distance / 20 m. With `goal_height` goal is (n, 4), the last number being the
         distance below the vehicle / 5 m. `paper`: velocity NED [m/s]; goal as north, east [m] and
         distance [m].
+        `candidates`: `candidates` (n, c, features), `commands` (n, c, 3) in shares of the maximum,
+        and `costs` (n, c) [s] of `planner.Candidates`, float32, as at first decisions.
         With additional inputs, `in_flight` (n, k) float32, as in `INPUTS`.
         An image of each additional camera as in `body`, for every layout: `grey_down`
         (n, frames, height, width) of a grey camera called down.

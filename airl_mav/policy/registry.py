@@ -23,7 +23,7 @@ from airl_mav.policy.actions import (
     discrete_actions,
 )
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
-from airl_mav.policy.layouts import ablated, boxes, encode_layout
+from airl_mav.policy.layouts import Encoded, ablated, boxes, layout_of
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import camera_mismatch, further_mismatch
 from airl_mav.policy.planner import PlannerPolicy, PlannerSettings
@@ -64,6 +64,7 @@ class LearnedPolicy:
         self._memory: cards.Memory | None = None
         """Memory of the network; None before the first decision."""
         self._count = cards.outputs_of(card.actions)
+        self._encoder = layout_of(card.observation.layout).encoder()
 
     @property
     def name(self) -> str:
@@ -102,8 +103,14 @@ class LearnedPolicy:
             if reason is not None:
                 raise errors.UsageError(f"policy {self.card.name}: {reason}")
             self._fitting = looks
-        encoded = encode_layout(self.card.observation, observation.rows(None))
-        return command(self.card.actions, self.act_batch(encoded)[0])
+        return command(self.card.actions, self.act_batch(self.encode(observation.rows(None)))[0])
+
+    def encode(self, seen: Observation) -> Encoded:
+        """Return the arrays of the card's layout for n vehicles; see `layouts.encode_layout`.
+
+        A layout with memory takes the observations of one flight, in order.
+        """
+        return self._encoder(self.card.observation, seen)
 
     def act_batch(
         self, encoded: Mapping[str, NDArray[Any]], rng: np.random.Generator | None = None

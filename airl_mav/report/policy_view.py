@@ -21,7 +21,7 @@ from airl_mav.core import constants, errors, files, frames, plugins
 from airl_mav.flight.episode_record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
-from airl_mav.policy import layouts, observation, observation_spec, registry
+from airl_mav.policy import observation, observation_spec, registry
 from airl_mav.policy.actions import commands, discrete_actions
 from airl_mav.prediction import Compensator, DecisionMemory
 from airl_mav.profiles.camera import Camera
@@ -145,8 +145,7 @@ def seen_decisions(
         setpoint = np.asarray(stamps[column][number], np.float64)
         scores = same = None
         if again is not None and policy is not None:
-            encoded = layouts.encode_layout(policy.card.observation, seen.rows(None))
-            scores = policy.outputs(encoded)[0]
+            scores = policy.outputs(policy.encode(seen.rows(None)))[0]
             best = again.actions[int(np.argmax(scores))]
             flown = setpoint[[0, 1, 3, 2]][: len(best)]
             same = bool(np.abs(best - flown).max() < SAME_ACTION)

@@ -20,9 +20,18 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs import observations
 from airl_mav.policy.images import NUMPY, Bytes, shrink_depth
-from airl_mav.policy.layouts import STRIP_ROWS, Encoded, ablated, boxes, encode_layout, newest_frame
-from airl_mav.policy.observation import Kinematics, Observation, observe
+from airl_mav.policy.layouts import (
+    STRIP_ROWS,
+    Encoded,
+    ablated,
+    boxes,
+    encode_layout,
+    layout_of,
+    newest_frame,
+)
+from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
+from airl_mav.policy.planner import LEARNED, OUTCOME_FEATURES, WORST_S, PlannerPolicy
 from airl_mav.profiles.projections import CHANNELS, KINDS, CameraKind
 
 FAR_MM = 65_535
@@ -498,3 +507,58 @@ def test_a_camera_serves_what_it_gives(asked: CameraKind, given: CameraKind) -> 
     camera = Intrinsics.from_fov(64, 48, math.pi / 2, kind=given)
     wanted = None if asked == given else f"{given} camera; accepted: {asked}"
     assert camera_mismatch(spec(kind=asked), camera) == wanted
+
+
+# --- candidates
+
+
+def told(n: int) -> dict[str, Any]:
+    """Return what the layout `candidates` needs besides `seen`."""
+    state = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)))
+    return {"states": (state,), "in_flight": InFlight.of_first_decisions(n)}
+
+
+def candidates_spec() -> ObservationSpec:
+    return spec("candidates", in_flight=["command", "latency"])
+
+
+def test_candidates_are_those_of_the_planner() -> None:
+    depth = np.zeros((2, 48, 64))
+    depth[1, :, 20:40] = 6000
+    looked, wanted = seen(depth, **told(2)), candidates_spec()
+    encoded = encode_layout(wanted, looked)
+    for key, box in boxes(wanted).items():
+        assert encoded[key].shape == (2, *box.shape)
+        assert encoded[key].dtype == box.dtype
+        assert np.isfinite(encoded[key]).all()
+    for i in range(2):
+        found = PlannerPolicy(LEARNED).candidates(looked.rows(i), features=True)
+        known = len(found.costs)
+        np.testing.assert_allclose(encoded["candidates"][i, :known], found.features, rtol=1e-6)
+        assert encoded["costs"][i].argmin() == found.costs.argmin()
+        assert (encoded["costs"][i, known:] == 2.0 * WORST_S).all()
+        best = encoded["commands"][i, found.costs.argmin()] * LEARNED.limits
+        np.testing.assert_allclose(best, found.commands[found.costs.argmin()], rtol=1e-6)
+
+
+def test_an_encoder_remembers_its_flight_alone() -> None:
+    wall = np.zeros((1, 48, 64))
+    wall[0, :, 20:40] = 6000
+    first, second = (layout_of("candidates").encoder() for _ in range(2))
+    free = seen(np.zeros((1, 48, 64)), **told(1))
+    for _ in range(3):
+        first(candidates_spec(), seen(wall, **told(1)))
+    remembered, fresh = (each(candidates_spec(), free) for each in (first, second))
+    # With the longest flight.
+    column = 2 * OUTCOME_FEATURES + 2
+    gap, free_gap = (each["candidates"][0, :100, column] for each in (remembered, fresh))
+    assert gap.min() < free_gap.min()
+    np.testing.assert_array_equal(fresh["costs"], encode_layout(candidates_spec(), free)["costs"])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("frames", 3), ("in_flight", []), ("goal_height", True)]
+)
+def test_candidates_reject_other_inputs(field: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{field}.*accepted.*with layout 'candidates'"):
+        spec("candidates", **({"in_flight": ["command", "latency"]} | {field: value}))

@@ -31,7 +31,7 @@ from airl_mav.policy.card import (
     read_model,
 )
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import Encoded, encode_layout
+from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.scenario.checks import action_generator
@@ -142,7 +142,6 @@ class _Witness:
     """Pilots of all vehicles with one network, recording its inputs. Implements `Pilots`."""
 
     pilots: LearnedPilots
-    policy: LearnedPolicy
     seen: list[Encoded] = field(default_factory=list)
 
     @property
@@ -153,9 +152,10 @@ class _Witness:
         self.pilots.begin(slot, seed)
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
-        encoded = encode_layout(self.policy.card.observation, seen)
+        decided = self.pilots.decide(seen, flying)
+        encoded = self.pilots.encoded
         self.seen.append({key: array[flying].copy() for key, array in encoded.items()})
-        return self.pilots.decide(seen, flying)
+        return decided
 
 
 def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, int]:
@@ -171,7 +171,7 @@ def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, in
     scenario = resolve(Scenario(level="gym", policy=str(folder), **asked))
     loaded = scenario.fresh_policy(FIRST_SEED)
     assert isinstance(loaded, LearnedPolicy)  # noqa: S101 (it has a card)
-    witness = _Witness(LearnedPilots(loaded, action_generator), loaded)
+    witness = _Witness(LearnedPilots(loaded, action_generator))
     navigation = gym_flier.navigation_of(scenario, min(scenario.scenario.slots, flights))
     for _ in fly_seeds(navigation, witness, list(scenario.seeds)):
         pass
