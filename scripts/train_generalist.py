@@ -109,7 +109,7 @@ def main() -> int:
     """Fly, train and export; return 0."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("out", type=Path)
-    parser.add_argument("--decisions", type=int, default=150_000)
+    parser.add_argument("--decisions", type=int, default=120_000)
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     torch.set_num_threads(1)
@@ -126,7 +126,7 @@ def main() -> int:
         risks.append(told)
     scorer = Scorer()
     train(scorer, np.concatenate(seen), np.concatenate(risks), asked.seed)
-    description = "planner's candidates, scored with a learned risk of collision"
+    description = "a network scores the planner's candidates with a learned risk of collision"
     facts: dict[str, Any] = {
         "name": "generalist",
         "description": description,
@@ -142,7 +142,7 @@ def main() -> int:
         "hold_s": HOLD_S,
         "goal_radius_m": 3.0,
         "altitude_m": 2.5,
-        "algorithm": "Monte Carlo value of the planner",
+        "algorithm": "monte-carlo",
         "training": {
             "arena": "crowded",
             "first_arena_seed": FIRST_TRAINING_SEED,

@@ -298,6 +298,9 @@ def _groups(points: Floats, ranges: Floats) -> list[tuple[int, int, bool]]:
 COURSES = 32
 """Courses of the candidates."""
 
+ASIDE_M_S = 3.75
+"""Maximum speed while the path is out of the camera's view."""
+
 BLIND_M = 1.0
 """Maximum distance flown during a decision [m]."""
 
@@ -323,8 +326,10 @@ def _search() -> tuple[Any, Any]:
 @cache
 def _kernels() -> Any:
     """Return the compiled functions, ready to run; imported late, as numba takes a second."""
-    from airl_mav.policy import planner_kernels
-
+    try:
+        from airl_mav.policy import planner_kernels
+    except ImportError:
+        raise UsageError("policy planner: needs numba; pip install numba") from None
     planner_kernels.warm_up()
     return planner_kernels
 
@@ -490,7 +495,10 @@ class PlannerPolicy:
         off = np.abs(np.mod(course - yaw + math.pi, 2.0 * math.pi) - math.pi)
         fan = np.stack([np.cos(course), np.sin(course)], axis=1)
         seen = fan[off < 0.5 * fov]
-        speeds = [v for v in self._settings.speeds_m_s if v * latency_s < BLIND_M or v <= CREEP_M_S]
+        # The way is not in view: the vehicle would turn into what it has not seen.
+        most = ASIDE_M_S if off[0] >= 0.5 * fov else math.inf
+        most = max(CREEP_M_S, min(most, BLIND_M / max(latency_s, 1e-9)))
+        speeds = [v for v in self._settings.speeds_m_s if v <= most]
         moves = [v * (fan if v <= CREEP_M_S else seen) for v in speeds]
         return np.concatenate([np.zeros((1, 2)), *moves])
 

@@ -14,6 +14,7 @@ from published.text import NONE, energy_kj, number, rate, table
 # --- the built-in policies
 
 SHIPPED: dict[str, tuple[str, str]] = {
+    "generalist": ("generalist", "generalist-crowded"),
     "static-obstacles": ("generalisation", "static-obstacles-static-obstacles"),
     "static-obstacles-ppo": ("static-obstacles-ppo", "run"),
     "static-obstacles-fast": ("static-obstacles-fast", "run"),
@@ -41,10 +42,11 @@ SHIPPED: dict[str, tuple[str, str]] = {
 RECORDS = tuple(dict.fromkeys(record for record, _ in SHIPPED.values()))
 """Records of these results."""
 
-_MAKERS = {"dqn": "double DQN", "ppo": "PPO", "dagger": "DAgger"}
+_MAKERS = {"dqn": "double DQN", "ppo": "PPO", "dagger": "DAgger", "monte-carlo": "Monte Carlo value"}
 _ACTIONS = {
     "arc-25": "arcs",
     "velocity": "continuous",
+    "velocity-yaw-rate": "planner's candidates",
     "velocity3d-fixed-yaw": "continuous, with a climb",
     "body-rates": "body rates and thrust",
 }
@@ -105,6 +107,21 @@ def policies_in_arenas(records: Records) -> str:
         cells = [f"**{c}**" if a == trained else c for a, c in zip(arenas, cells, strict=True)]
         rows.append((f"`{policy}`" + (" (classical)" if own is None else ""), *cells))
     return table(("policy", *(Path(arena).stem for arena in arenas)), rows, len(arenas))
+
+
+@block("generalist", "generalist")
+def generalist(records: Records) -> str:
+    rows = [
+        (
+            f"`{Path(run.arena).stem}`",
+            f"{rate(run)} %",
+            f"{number(run.flight_time_s, 2)} s",
+            f"{number(run.distance_m, 1)} m",
+            f"{energy_kj(run)} kJ",
+        )
+        for run in records["generalist"].runs.values()
+    ]
+    return table(("arena", "success", "time", "distance", "energy"), rows)
 
 
 # --- without one input

@@ -27,7 +27,6 @@ from airl_mav.flight.statistics import (
 )
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from airl_mav.report.comparison import show
-from airl_mav.scenario.model import DEFAULT_POLICY
 from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
 from tests.support.page_alone import page_alone
@@ -41,7 +40,7 @@ TARGET, REFERENCE = "static-obstacles-target", "static-obstacles-reference"
 
 def verdict(out: Path, *, page: bool = False, **options: Any) -> tuple[int, str]:
     """Run the command in this process; without `page`, which takes longer than flights, none."""
-    policy = [policy] if (policy := options.pop("policy", None)) else []
+    policy = [options.pop("policy", "static-obstacles-fast")]
     with (
         nullcontext()
         if page
@@ -206,7 +205,10 @@ def test_two_policies_fly_until_their_gap_is_decided(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"against": DEFAULT_POLICY}, f"--against {DEFAULT_POLICY}: accepted: another policy"),
+        (
+            {"against": "static-obstacles-fast"},
+            "--against static-obstacles-fast: accepted: another policy",
+        ),
         (
             {"against": "static-obstacles-ras-pi-4", "reference": "ras-pi-4"},
             "left out with --reference",

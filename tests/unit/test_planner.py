@@ -21,6 +21,8 @@ from scipy import ndimage, signal
 from airl_mav import Scenario, rehearse
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
+from airl_mav import policy
+from airl_mav.policy import planner
 from airl_mav.policy import planner_kernels as kernels
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import InFlight
@@ -208,9 +210,16 @@ def test_no_path_leads_through_a_wall_one_cell_thick() -> None:
     assert (np.abs(crossing[:, 1] - 12.0) < 1.2).all()
 
 
-def test_without_scipy_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "scipy.sparse", None)
-    with pytest.raises(UsageError, match="needs scipy"):
+@pytest.mark.parametrize(
+    ("module", "package"), [("scipy.sparse", "scipy"), ("airl_mav.policy.planner_kernels", "numba")]
+)
+def test_without_a_library_there_is_one_line(
+    module: str, package: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planner._kernels.cache_clear()
+    monkeypatch.delattr(policy, "planner_kernels", raising=False)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=f"needs {package}; pip install {package}"):
         PlannerPolicy()
 
 
@@ -377,6 +386,12 @@ def test_late_decisions_fly_slowly() -> None:
     assert np.hypot(*wishes.T).max() == pytest.approx(2.5)
     wishes = PlannerPolicy(LEARNED)._wishes(0.0, 0.0, FOV, 0.1)
     assert np.hypot(*wishes.T).max() == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize(("bearing", "most"), [(0.6, 7.0), (1.0, 3.75), (-2.0, 3.75)])
+def test_it_flies_slowly_while_its_path_is_out_of_view(bearing: float, most: float) -> None:
+    wishes = PlannerPolicy(LEARNED)._wishes(bearing, 0.0, FOV, 0.01)
+    assert np.hypot(*wishes.T).max() == pytest.approx(most)
 
 
 def test_it_knows_the_setpoint_in_flight() -> None:
