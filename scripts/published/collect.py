@@ -120,21 +120,29 @@ def _sweep(out: Path) -> _Table:
     """Return the success of a sweep's networks, layers by filters in each arena."""
     path = out / SWEEP_FILE
     data = read_json(path, SWEEP_SCHEMA, "sweep")
-    if data["trials_ended"] < data["trials_planned"]:
+    if not all(cell["trials"] for cell in data["cells"]):
         raise UsageError(f"{path}: {data['trials_ended']} trials of {data['trials_planned']}")
     filters = sorted({cell["filters"] for cell in data["cells"]})
     rows: dict[tuple[str, int], dict[int, str]] = {}
+    seeds: dict[tuple[str, int], set[int]] = {}
     for cell in data["cells"]:
         best = data["best"][cell["arena"]]
-        value, std = 100.0 * cell["success_rate"]["value"], 100.0 * cell["success_std"]
-        shown = f"{value:.1f} ± {std:.1f}"
+        shown = f"{100.0 * cell['success_rate']['value']:.1f}"
+        if cell["success_std"] is not None:
+            shown += f" ± {100.0 * cell['success_std']:.1f}"
         if (cell["layers"], cell["filters"]) == (best["layers"], best["filters"]):
             shown = f"**{shown}**"
-        rows.setdefault((cell["arena"], cell["layers"]), {})[cell["filters"]] = shown
-    columns = ("arena", "layers", *(f"{n} filters" for n in filters))
+        key = cell["arena"], cell["layers"]
+        rows.setdefault(key, {})[cell["filters"]] = shown
+        seeds.setdefault(key, set()).add(len(cell["trials"]))
+    columns = ("arena", "layers", "seeds", *(f"{n} filters" for n in filters))
     lines = tuple(
-        (arena, f"{layers}", *(row.get(n, "") for n in filters))
-        for (arena, layers), row in rows.items()
+        (
+            *map(str, key),
+            " to ".join(map(str, sorted(seeds[key]))),
+            *(row.get(n, "") for n in filters),
+        )
+        for key, row in rows.items()
     )
     return _Table(Printed(columns=columns, rows=lines), data["made"])
 

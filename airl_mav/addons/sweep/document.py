@@ -242,7 +242,7 @@ def document_of(sweep: summary.Sweep) -> document.Document:
         footer=(
             f"airl-mav {made['versions'].get('airl-mav', '')} · figures as data in "
             f"{summary.SWEEP_FILE} beside this page; a trial's policy flies with airl-sitl "
-            "--policy trials/<trial>/policy"
+            "--policy <trial>/policy"
         ),
     )
 
@@ -281,7 +281,6 @@ def sweep_facts(sweep: summary.Sweep) -> document.Facts:
     )
     last = judged.seed + judged.episodes - 1
     rows = [
-        ("what", config.description),
         ("trials", f"{sweep.ended} of {sweep.planned} ended"),
         ("networks", "; ".join(networks)),
         ("training seeds", _listed(config.seeds)),
