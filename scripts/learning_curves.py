@@ -4,7 +4,7 @@
 
 Defaults to the paper's algorithm exploration (DQN and PPO, with and without curriculum), and the
 training of `static-obstacles`. Each run is a separate `airl train` that survives a kill: start the
-script again to resume. The picture shows the success rate on the selection seeds, mean over the
+script again to resume. The picture shows success and reward on the selection seeds, mean over the
 training seeds with a 95 % interval (Student's t). The table shows the decisions until each
 configuration reached 97 %, not the time, which depends on the machine's load. Writes curves.png,
 curves.md and table.json.
@@ -102,29 +102,30 @@ def collect(command: Command, name: str) -> list[list[Evaluation]]:
 
 
 def grid(runs: Sequence[Sequence[Evaluation]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return steps (k,) and success rates (seeds, k) at the evaluations common to all runs."""
+    """Return steps (k,), and success [%] and reward (2, seeds, k), where all runs have them."""
     k = min(len(run) for run in runs)
     steps = np.array([each.steps for each in runs[0][:k]], np.float64)
-    return steps, np.array([[each.success_rate for each in run[:k]] for run in runs])
+    rates = [[100.0 * each.success_rate for each in run[:k]] for run in runs]
+    return steps, np.array([rates, [[each.reward for each in run[:k]] for run in runs]], np.float64)
 
 
 def draw(curves: dict[str, list[list[Evaluation]]], path: Path) -> None:
-    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
-    ax = figure.add_subplot()
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    axes = figure.subplots(1, 2)
     for name, runs in curves.items():
-        steps, rates = grid(runs)
-        mean = rates.mean(axis=0)
-        half = (
-            stats.t.ppf(0.975, len(rates) - 1) * stats.sem(rates, axis=0) if len(rates) > 1 else 0
-        )
-        (line,) = ax.plot(steps / 1e3, 100 * mean, label=f"{Path(name).stem} (n = {len(rates)})")
-        low, high = np.clip(mean - half, 0, 1), np.clip(mean + half, 0, 1)
-        ax.fill_between(steps / 1e3, 100 * low, 100 * high, alpha=0.15, color=line.get_color())
-    ax.set_xlabel("decisions of all vehicles, thousands")
-    ax.set_ylabel("success on the selection seeds, %")
-    ax.set_ylim(0, 101)
-    ax.grid(alpha=0.25)
-    ax.legend(frameon=False, fontsize=8.5, loc="lower right")
+        steps, both = grid(runs)
+        for ax, values, most in zip(axes, both, (100.0, np.inf), strict=True):
+            mean, n = values.mean(axis=0), len(values)
+            half = stats.t.ppf(0.975, n - 1) * stats.sem(values, axis=0) if n > 1 else 0
+            (line,) = ax.plot(steps / 1e3, mean, label=f"{Path(name).stem} (n = {n})")
+            low, high = np.clip([mean - half, mean + half], 100.0 - most, most)
+            ax.fill_between(steps / 1e3, low, high, alpha=0.15, color=line.get_color())
+    for ax, label in zip(axes, ("success on the selection seeds, %", "reward"), strict=True):
+        ax.set_xlabel("decisions of all vehicles, thousands")
+        ax.set_ylabel(label)
+        ax.grid(alpha=0.25)
+    axes[0].set_ylim(0, 101)
+    axes[0].legend(frameon=False, fontsize=8.5, loc="lower right")
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=150)
 

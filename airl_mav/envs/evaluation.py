@@ -54,6 +54,8 @@ class EpisodeResult:
     distance_m: float
     energy_j: float
     decisions: int
+    reward: float
+    """Sum of a built-in reward, without costs; 0 for a custom one."""
     failure: str = ""
     """Reason of an aborted flight: the policy's error."""
 
@@ -259,7 +261,7 @@ def fly_seeds(
     """
     n = navigation.n
     waiting = list(reversed(seeds))
-    decisions = np.zeros(n, np.int64)
+    decisions, paid = np.zeros(n, np.int64), np.zeros(n)
     busy = np.zeros(n, np.bool_)
 
     def begin(slots: Sequence[int]) -> None:
@@ -268,7 +270,7 @@ def fly_seeds(
         navigation.begin(slots, taken, zone)
         for slot, seed in zip(slots, taken, strict=True):
             pilots.begin(slot, seed)
-        decisions[slots] = 0
+        decisions[slots], paid[slots] = 0, 0.0
         busy[slots] = True
 
     begin(range(n))
@@ -277,6 +279,7 @@ def fly_seeds(
         navigation.fleet.verdict[list(failed := pilots.failed)] = FlightStatus.ABORTED
         navigation.fly(decided)
         decisions += 1
+        paid += navigation.paid
         now = navigation.flights()
         ended = np.flatnonzero(busy & (now.verdict != FlightStatus.FLYING)).tolist()
         for i in ended:
@@ -290,6 +293,7 @@ def fly_seeds(
                     distance_m=float(now.distance_m[i]),
                     energy_j=float(now.energy_j[i]),
                     decisions=int(decisions[i]),
+                    reward=float(paid[i]),
                     failure=failed.get(i, ""),
                 ),
             )

@@ -212,6 +212,11 @@ class NStepReplay(Ring):
         return slot
 
 
+def autocast(device: torch.device, precision: Precision) -> AbstractContextManager[Any]:
+    """Return the context for forward passes with a precision."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16")
+
+
 class DoubleDQN(DQN):
     """DQN with double Q-learning, n-step returns and Dict observations of n vehicles.
 
@@ -273,7 +278,7 @@ class DoubleDQN(DQN):
         actions = self.generator.integers(choices, size=n_envs)
         if greedy.any():
             seen = cast("Mapping[str, NDArray[Any]]", self._last_obs)
-            with torch.no_grad(), self._autocast():
+            with torch.no_grad(), autocast(self.device, self.precision):
                 values = self.q_net(self._tensors({k: v[greedy] for k, v in seen.items()}))
             actions[greedy] = values.argmax(dim=1).cpu().numpy()
         return actions, actions
@@ -315,12 +320,12 @@ class DoubleDQN(DQN):
         """Run one update and return its loss."""
         following = self._tensors(batch.next_observations)
         returns, discounts = self._tensor(batch.returns), self._tensor(batch.discounts)
-        with torch.no_grad(), self._autocast():
+        with torch.no_grad(), autocast(self.device, self.precision):
             values = self.q_net_target(following).float()
             chooser = self.q_net(following) if self.double else values
             chosen = chooser.argmax(dim=1, keepdim=True)
             target = returns + discounts * values.gather(1, chosen).squeeze(1)
-        with self._autocast():
+        with autocast(self.device, self.precision):
             estimates = self.q_net(self._tensors(batch.observations)).float()
         taken = estimates.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
         loss = functional.smooth_l1_loss(taken, target)
@@ -336,10 +341,6 @@ class DoubleDQN(DQN):
     def _due(self, interval: int) -> int:
         """Return the number of multiples of an interval within the last step of all vehicles."""
         return self.num_timesteps // interval - (self.num_timesteps - self.n_envs) // interval
-
-    def _autocast(self) -> AbstractContextManager[Any]:
-        wanted = self.precision == "bfloat16"
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=wanted)
 
     def _tensor(self, array: NDArray[Any]) -> torch.Tensor:
         return torch.from_numpy(array).to(self.device)

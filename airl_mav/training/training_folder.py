@@ -40,6 +40,8 @@ class Evaluation:
     """Success rate of the last training episodes, including exploration."""
     zone: int | None
     """Open curriculum zone; None without a curriculum."""
+    reward: float | None = None
+    """Mean sum of a built-in reward in an episode, without costs; None in older files."""
 
     @property
     def rank(self) -> tuple[float, float]:

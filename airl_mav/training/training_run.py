@@ -331,6 +331,7 @@ def summary(
         distance_m=mean_of_successes(flown, "distance_m"),
         training_success=training_success,
         zone=zone,
+        reward=sum(each.reward for each in flown) / len(flown),
     )
 
 

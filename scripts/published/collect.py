@@ -117,25 +117,34 @@ def _roofline(out: Path) -> _Table:
 
 
 def _sweep(out: Path) -> _Table:
-    """Return the success of a sweep's networks in its first arena, layers by filters."""
+    """Return the success of a sweep's networks, layers by filters in each arena."""
     path = out / SWEEP_FILE
     data = read_json(path, SWEEP_SCHEMA, "sweep")
-    if data["trials_ended"] < data["trials_planned"]:
+    if not all(cell["trials"] for cell in data["cells"]):
         raise UsageError(f"{path}: {data['trials_ended']} trials of {data['trials_planned']}")
-    arena, best = next(iter(data["best"].items()))
-    cells = {(c["layers"], c["filters"]): c for c in data["cells"] if c["arena"] == arena}
-
-    def cell(layers: int, filters: int) -> str:
-        found = cells[layers, filters]
-        value, std = 100.0 * found["success_rate"]["value"], 100.0 * found["success_std"]
-        shown = f"{value:.1f} ± {std:.1f}"
-        is_best = (layers, filters) == (best["layers"], best["filters"])
-        return f"**{shown}**" if is_best else shown
-
-    layers, filters = (sorted({key[axis] for key in cells}) for axis in (0, 1))
-    columns = ("%", *(f"{n} filters" for n in filters))
-    rows = tuple((f"{k} layers", *(cell(k, n) for n in filters)) for k in layers)
-    return _Table(Printed(columns=columns, rows=rows), data["made"])
+    filters = sorted({cell["filters"] for cell in data["cells"]})
+    rows: dict[tuple[str, int], dict[int, str]] = {}
+    seeds: dict[tuple[str, int], set[int]] = {}
+    for cell in data["cells"]:
+        best = data["best"][cell["arena"]]
+        shown = f"{100.0 * cell['success_rate']['value']:.1f}"
+        if cell["success_std"] is not None:
+            shown += f" ± {100.0 * cell['success_std']:.1f}"
+        if (cell["layers"], cell["filters"]) == (best["layers"], best["filters"]):
+            shown = f"**{shown}**"
+        key = cell["arena"], cell["layers"]
+        rows.setdefault(key, {})[cell["filters"]] = shown
+        seeds.setdefault(key, set()).add(len(cell["trials"]))
+    columns = ("arena", "layers", "seeds", *(f"{n} filters" for n in filters))
+    lines = tuple(
+        (
+            *map(str, key),
+            " to ".join(map(str, sorted(seeds[key]))),
+            *(row.get(n, "") for n in filters),
+        )
+        for key, row in rows.items()
+    )
+    return _Table(Printed(columns=columns, rows=lines), data["made"])
 
 
 def _table(out: Path) -> _Table:

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
 from airl_mav.addons.imitation.imitation import StatefulExpert, choices
-from airl_mav.addons.imitation.planner import PlannerBody, map_of
+from airl_mav.addons.imitation.planner import PlannerBody, beside, map_of
 from airl_mav.envs.evaluation import (
     EpisodeResult,
     fly_episodes,
@@ -104,6 +105,11 @@ def test_the_map_is_the_way_around() -> None:
     centers = arenas.center[0, : arenas.n_static[0], :2]
     inside = np.rint((centers - (among.north, among.east)) / among.cell).astype(int)
     assert (among.gap[inside[:, 0], inside[:, 1]] < 0.0).all()
+    for row, column in ((0, 0), (30, 40), (61, 17), *inside.tolist()):
+        at = among.north + row * among.cell, among.east + column * among.cell
+        walls = np.abs(arenas.bounds[0, :4] - np.repeat(at, 2))
+        found = [beside(arenas, 0, k, body, *at) for k in range(arenas.n_static[0])]
+        assert among.gap[row, column] == pytest.approx(min(*found, *walls))
 
 
 def config(name: str, **changes: Any) -> TrainingConfig:
@@ -181,6 +187,21 @@ def test_goes_on_bit_for_bit(name: str, actions: str, tmp_path: Path) -> None:
     assert not any(
         ours[key].equal(fresh(1).policy.state_dict()[key]) for key in ours if "action_net" in key
     )
+
+
+def test_bfloat16_learns_as_float32_does() -> None:
+    losses = []
+    for precision in ("float32", "bfloat16"):
+        algorithm = {"name": "bc", "learning_starts": 40, "batch_size": 32, "precision": precision}
+        environment = SMALL | {"arena": "no-obstacles", "actions": "velocity"}
+        asked = config("bc", environment=environment, algorithm=algorithm)
+        env = NavigationVecEnv(NavigationVectorEnv(4, asked.environment))
+        env.seed(1)
+        model: Any = make_model(asked.algorithm, asked.network, env, 1)
+        model.learn(400)
+        assert all(weights.dtype == torch.float32 for weights in model.policy.parameters())
+        losses.append(model._update())
+    assert losses[0] != losses[1] == pytest.approx(losses[0], rel=0.1)
 
 
 def test_cloning_never_flies_the_learner() -> None:

@@ -259,19 +259,19 @@ def test_the_best_of_equals_is_the_smaller_network(tmp_path: Path) -> None:
     folder = SweepFolder(tmp_path, config)
     every = trials(config)
     # All alike, but for the smallest network, which is worse.
-    counts = [100 if t.network == "2x8" else 290 for t in every]
+    counts = [100 if t.network == "2x32" else 290 for t in every]
     for result in fake_results(config, every, counts):
         folder.trial_path(result.trial).mkdir(parents=True)
         folder.finish(result, tmp_path / "none")
     sweep = summarize(folder, MADE)
     best = sweep.best("static-obstacles")
     assert best is not None
-    known = [c for c in sweep.cells if c.network != "2x8"]
+    known = [c for c in sweep.of("static-obstacles") if c.network != "2x32"]
     assert best.macs == min(cell.macs for cell in known)
     assert {cell.network for cell in sweep.rivals("static-obstacles")} == (
         {cell.network for cell in known} - {best.network}
     )
-    assert sweep.ended == sweep.planned == 18
+    assert sweep.ended == sweep.planned == 135
 
 
 def test_estimated_latency_is_in_proportion_to_the_nearest_workload() -> None:

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import Progress
 from airl_mav.envs.evaluation import fly_episodes, success_rate
+from airl_mav.envs.sb3 import make_vec_env
+from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import load_learned
@@ -206,6 +208,18 @@ def test_who_flies_well_by_chance_alone_is_told(in_training: float | None, told:
     evaluation = Evaluation(5_000, 60.0, 300, 0.36, 0.64, 2.4, 15.0, in_training, None)
     TrainingProgress(Noted(), 10_000).evaluated(evaluation, best=False)
     assert notes == [f"      5,000 decisions      60 s  success  36.0%    2.40 s{told}"]
+
+
+def test_the_reward_of_an_evaluation_is_the_environments() -> None:
+    spec = EnvironmentSpec(image_width_px=16, image_height_px=12)
+    env = make_vec_env(1, spec)
+    env.seed(1)
+    env.reset()
+    while not (info := env.step(np.array([12]))[3][0]):
+        pass
+    episode = info["episode"]
+    (flown,) = fly_episodes(spec, lambda seen: np.array([12]), [episode["seed"]])
+    assert flown.reward == pytest.approx(episode["r"])
 
 
 @pytest.mark.nightly

@@ -105,6 +105,7 @@ class Imitation(BaseAlgorithm):
         expert_share_final: float = 0.0,
         expert_share_fraction: float = 0.3,
         max_grad_norm: float = 1.0,
+        precision: config.Precision = "float32",
         _init_setup_model: bool = True,
         **arguments: Any,
     ) -> None:
@@ -123,6 +124,7 @@ class Imitation(BaseAlgorithm):
         self.env_steps_per_update = env_steps_per_update
         self.expert_shares = expert_share_initial, expert_share_final, expert_share_fraction
         self.max_grad_norm = max_grad_norm
+        self.precision = precision
         if _init_setup_model:
             self._setup_model()
 
@@ -216,9 +218,12 @@ class Imitation(BaseAlgorithm):
         """Run one update and return its loss."""
         observations, actions = self.replay.sample(self.batch_size, self.generator)
         wanted = torch.from_numpy(actions).to(self.device)
-        distribution = self.policy.get_distribution(
-            {key: torch.from_numpy(a).to(self.device) for key, a in observations.items()}
-        )
+        seen = {key: torch.from_numpy(a).to(self.device) for key, a in observations.items()}
+        policy = self.policy
+        with dqn.autocast(self.device, self.precision):
+            features = policy.extract_features(seen, policy.pi_features_extractor)
+            latent = policy.mlp_extractor.forward_actor(cast("torch.Tensor", features))
+        distribution = policy._get_action_dist_from_latent(latent.float())
         if isinstance(self.action_space, spaces.Discrete):
             loss = -distribution.log_prob(wanted).mean()
         else:

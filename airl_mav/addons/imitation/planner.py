@@ -178,7 +178,11 @@ def _fill_gaps(
                 min(north - bounds[0], bounds[1] - north), min(east - bounds[2], bounds[3] - east)
             )
             for obstacle in range(batch.n_static[i]):
-                least = min(least, beside(batch, i, obstacle, body, north, east))
+                # Beyond `reach`, from an upper bound of the half diagonal, it is no nearer.
+                half, center = batch.half_size[i, obstacle], batch.center[i, obstacle]
+                reach = half[0] + half[1] + max(least, 0.0)
+                if (north - center[0]) ** 2 + (east - center[1]) ** 2 < reach * reach:
+                    least = min(least, beside(batch, i, obstacle, body, north, east))
             gap[row, column] = least
 
 
@@ -471,10 +475,10 @@ def best_command(
         for straight_on in STRAIGHT_ON_S:
             x, y, vx, vy, nose = position[0], position[1], velocity[0], velocity[1], facing
             t, step, cost = 0.0, 0, 0.0
-            there, looked = False, timing.turn == 0.0
+            there, looked, ahead = False, timing.turn == 0.0, 0.0
             cn, sn = math.cos(nose), math.sin(nose)
-            # Stop early once the cost exceeds the best.
-            while t < horizon and cost + t < least and not there:
+            # Stop early once the cost, with a straight flight to the goal, exceeds the best.
+            while t < horizon and cost + t + ahead < least and not there:
                 forward, right, rate = commands[c, 0], commands[c, 1], commands[c, 2]
                 # Until the new command acts, the vehicle follows the last one.
                 if t < timing.lead:
@@ -508,7 +512,8 @@ def best_command(
                 if moving < WARY_GAP_M:
                     cost += WARY * (WARY_GAP_M - moving) * STEP_S
                 dx, dy = x - batch.goal[i, 0], y - batch.goal[i, 1]
-                there = dx * dx + dy * dy < body.arrived * body.arrived
+                away = math.sqrt(dx * dx + dy * dy)
+                there, ahead = away < body.arrived, (away - body.arrived - 1.0) / body.top_speed
             # Time flown, plus the map's time from the end of the prediction.
             cost += t
             if not there:

@@ -7,7 +7,7 @@ from airl_mav.training.algorithm_table import Algorithm, number, options_of, sam
 _SOURCE = "airl_mav.addons.imitation.imitation.Imitation"
 _FIELDS = same(
     *("learning_rate", "batch_size", "buffer_size", "learning_starts"),
-    *("env_steps_per_update", "expert"),
+    *("env_steps_per_update", "expert", "precision"),
 )
 _COMMON = "stats_window_size max_grad_norm"
 

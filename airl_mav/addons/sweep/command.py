@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,6 @@ from airl_mav.addons.sweep.config import (
     Trial,
     TrialResult,
     load_sweep,
-    size_of,
     trials,
 )
 from airl_mav.addons.sweep.document import document_of, print_plan
@@ -32,15 +31,14 @@ from airl_mav.addons.sweep.summary import (
     write_sweep,
 )
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.core import child_process, clock, constants, errors, fields
-from airl_mav.core.progress import Bar, Progress, RichProgress, new_console
+from airl_mav.core import child_process, errors, fields
+from airl_mav.core.progress import Progress, RichProgress, new_console
 from airl_mav.experiments import executors
 from airl_mav.experiments.campaign import open_campaign
 from airl_mav.profiles import arena, loading
 from airl_mav.profiles.computer import load_computer
 from airl_mav.report.document import print_document, print_place, write_document
 from airl_mav.scenario.model import Workers
-from airl_mav.training.training_folder import TrainingFolder
 
 
 class SweepOptions(Workers):
@@ -57,8 +55,9 @@ class SweepOptions(Workers):
 
     sweep: Annotated[str, POSITIONAL] = Field(
         default="quick",
-        description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
-        " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
+        description="quick (the paper's grid, taught by the planner: two cores, an hour), full (by"
+        " DQN), paper (on the paper's image, for GPUs), tiny (seconds, shows nothing), or a path"
+        " to a .toml",
     )
     out: Path | None = fields.optional("folder of the sweep; by default runs/sweep-<name>")
     seeds: int | None = fields.quantity(
@@ -144,13 +143,6 @@ class SweepOptions(Workers):
         return computer
 
 
-LOOK_US = constants.US_PER_S
-"""Interval at which the evaluations of the trainings are read [wall µs]."""
-
-MOST_BARS = 12
-"""Maximum number of running trials with a progress bar."""
-
-
 def _worker(
     folder: SweepFolder,
     command: str,
@@ -197,78 +189,34 @@ def run_sweep(
 
         sweep, wanted = summary(), trials(config)
         waiting = [trial for trial in wanted if folder.result(trial) is None]
-        bars = _TrialBars(progress, folder, len(wanted), waiting)
-
-        def stopped() -> bool:
-            bars.look()
-            return stop()
-
+        bar = progress.bar("sweep", len(wanted), completed=sweep.ended, unit="trials")
         results = executor.run(
             waiting,
             partial(_worker, folder, command, device, mixed_code),
             name=lambda trial: trial.name,
-            stop=stopped,
+            stop=stop,
             lost=say,
         )
         try:
             with closing(results):
                 for _, result in results:
-                    bars.finished(result)
                     sweep = summary()
+                    progress.note(_line(sweep.ended, len(wanted), result))
+                    bar.update(completed=sweep.ended)
         except executors.WorkerError as error:
             return sweep, str(error)
         return sweep, None
 
 
-class _TrialBars:
-    """Progress bar of the sweep, a bar for each running trial, and a line for each finished one."""
-
-    def __init__(
-        self, progress: Progress, folder: SweepFolder, total: int, waiting: Sequence[Trial]
-    ) -> None:
-        self._progress, self._folder = progress, folder
-        self._total, self._steps = total, folder.config.training.steps
-        # Measured on one core: a decision's cost grows more slowly than its multiply-accumulates.
-        self._left = {trial: size_of(folder.config, trial).macs ** 0.75 for trial in waiting}
-        self._bar = progress.bar("sweep", sum(self._left.values()) or 1.0)
-        self._bars: dict[Trial, Bar] = {}
-        self._done = 0.0
-        self._clock, self._due_us = clock.WallClock(), 0
-
-    def finished(self, result: TrialResult) -> None:
-        """Count a finished trial."""
-        trial, trained = result.trial, result.trained
-        self._done += self._left.pop(trial)
-        if trial in self._bars:
-            self._bars.pop(trial).close()
-        self._progress.note(
-            f"{self._total - len(self._left):>{len(str(self._total))}}/{self._total}  "
-            f"{trial.arena_name}  {trial.network:>6}  seed {trial.seed}  success "
-            f"{result.success_rate:6.1%} of {result.episodes}, best after "
-            f"{trained.best_steps:,} of {trained.steps:,} decisions, {trained.seconds:,.0f} s"
-        )
-        self._due_us = 0
-        self.look()
-
-    def look(self) -> None:
-        """Update the progress of the trainings; cheap, call it often."""
-        if self._clock.time_us() < self._due_us:
-            return
-        self._due_us = self._clock.time_us() + LOOK_US
-        done = self._done
-        for trial, work in self._left.items():
-            evaluations = TrainingFolder(self._folder.trial_path(trial)).evaluations()
-            if not evaluations:
-                continue
-            last = evaluations[-1]
-            done += work * min(last.steps / self._steps, 1.0)
-            if trial not in self._bars and len(self._bars) < MOST_BARS:
-                self._bars[trial] = self._progress.bar(trial.name, self._steps, unit="decisions")
-            if trial in self._bars:
-                success = f"success {last.success_rate:.0%}"
-                self._bars[trial].update(completed=last.steps, postfix=success)
-        ended = self._total - len(self._left)
-        self._bar.update(completed=done, postfix=f"{ended}/{self._total} trials")
+def _line(ended: int, total: int, result: TrialResult) -> str:
+    """Return the line of a finished trial."""
+    trial, trained = result.trial, result.trained
+    return (
+        f"{ended:>{len(str(total))}}/{total}  "
+        f"{trial.arena_name}  {trial.network:>6}  seed {trial.seed}  success "
+        f"{result.success_rate:6.1%} of {result.episodes}, best after "
+        f"{trained.best_steps:,} of {trained.steps:,} decisions, {trained.seconds:,.0f} s"
+    )
 
 
 OPTIONS = SweepOptions

@@ -7,14 +7,16 @@ import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from airl_mav.addons.sweep import summary
 from airl_mav.addons.sweep.config import SweepConfig, training_of, trials
 from airl_mav.core.machine import mixed_code
-from airl_mav.report import document, heatmap
-from airl_mav.report.theme import FigureImage
+from airl_mav.report import document, heatmap, theme
+from airl_mav.training.training_folder import TrainingFolder
 
 Described = tuple[document.Column, Callable[[summary.NetworkSummary], str]]
 """Column, and the function that formats its cells."""
@@ -140,7 +142,7 @@ def _table(
     return document.TableView(key, title, tuple(column for column, _ in shown), rows, tuple(notes))
 
 
-def success_pictures(sweep: summary.Sweep, arena: str) -> list[FigureImage]:
+def success_pictures(sweep: summary.Sweep, arena: str) -> list[theme.FigureImage]:
     """Draw the mean success rate of each network of an arena, with its standard deviation."""
     best = sweep.best(arena)
     known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
@@ -175,6 +177,38 @@ def _success_text(cell: summary.NetworkSummary) -> str:
     return text
 
 
+def curves(sweep: summary.Sweep) -> list[theme.FigureImage]:
+    """Draw success and reward of each network over decisions, mean over the training seeds."""
+    figure = theme.new_figure(3.2 * len(sweep.arenas), 5.0)
+    axes = figure.subplots(2, len(sweep.arenas), sharex=True, sharey="row", squeeze=False)
+    for arena, column in zip(sweep.arenas, axes.T, strict=True):
+        best = sweep.best(arena)
+        for cell in sweep.of(arena):
+            folders = [sweep.folder.trial_path(each.trial) for each in cell.results]
+            runs = [TrainingFolder(folder).evaluations() for folder in folders]
+            if not runs or not all(runs):
+                continue
+            # Old evaluations have no reward; a seed that ended early has fewer evaluations.
+            least = min(len(run) for run in runs)
+            seen = [[(e.steps, 100.0 * e.success_rate, e.reward) for e in r[:least]] for r in runs]
+            steps, *means = np.array(seen, np.float64).mean(axis=0).T
+            style: dict[str, Any] = {"color": theme.SERIES, "alpha": 0.5, "lw": 0.9}
+            if cell is best:
+                style = {"color": theme.MARK, "lw": 2.0, "zorder": 3, "label": cell.network}
+            for ax, values in zip(column, means, strict=True):
+                ax.plot(steps / 1e3, values, **style)
+        theme.label_axes(column[0], title=arena)
+        theme.label_axes(column[1], "decisions, thousands")
+        if column[0].lines:
+            column[0].legend(frameon=False, fontsize=8, labelcolor=theme.INK, loc="lower right")
+    for ax, label in zip(axes[:, 0], ("success on the selection seeds [%]", "reward"), strict=True):
+        theme.label_axes(ax, y=label)
+    for ax in axes.flat:
+        theme.plain_axes(ax)
+    alt = "Success and reward of each network over decisions; the best network is highlighted"
+    return [theme.render(figure, "sweep-curves", alt)]
+
+
 def document_of(sweep: summary.Sweep) -> document.Document:
     """Return the page of a sweep with at least one finished trial."""
     sections = [
@@ -186,6 +220,7 @@ def document_of(sweep: summary.Sweep) -> document.Document:
         )
         for arena in sweep.arenas
     ]
+    sections.append(document.Section("Learning curves", draw=partial(curves, sweep)))
     made = sweep.made
     begun = f"{made['created_utc']}".replace("T", " ").replace("+00:00", " UTC")
     return document.Document(
@@ -207,7 +242,7 @@ def document_of(sweep: summary.Sweep) -> document.Document:
         footer=(
             f"airl-mav {made['versions'].get('airl-mav', '')} · figures as data in "
             f"{summary.SWEEP_FILE} beside this page; a trial's policy flies with airl-sitl "
-            "--policy trials/<trial>/policy"
+            "--policy <trial>/policy"
         ),
     )
 
@@ -246,7 +281,6 @@ def sweep_facts(sweep: summary.Sweep) -> document.Facts:
     )
     last = judged.seed + judged.episodes - 1
     rows = [
-        ("what", config.description),
         ("trials", f"{sweep.ended} of {sweep.planned} ended"),
         ("networks", "; ".join(networks)),
         ("training seeds", _listed(config.seeds)),
