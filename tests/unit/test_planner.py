@@ -18,10 +18,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage, signal
 
-from airl_mav import Scenario, rehearse
+from airl_mav import Scenario, policy, rehearse
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
-from airl_mav import policy
 from airl_mav.policy import planner
 from airl_mav.policy import planner_kernels as kernels
 from airl_mav.policy.actions import Action
