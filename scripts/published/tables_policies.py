@@ -42,7 +42,12 @@ SHIPPED: dict[str, tuple[str, str]] = {
 RECORDS = tuple(dict.fromkeys(record for record, _ in SHIPPED.values()))
 """Records of these results."""
 
-_MAKERS = {"dqn": "double DQN", "ppo": "PPO", "dagger": "DAgger", "monte-carlo": "Monte Carlo value"}
+_MAKERS = {
+    "dqn": "double DQN",
+    "ppo": "PPO",
+    "dagger": "DAgger",
+    "monte-carlo": "Monte Carlo value",
+}
 _ACTIONS = {
     "arc-25": "arcs",
     "velocity": "continuous",
