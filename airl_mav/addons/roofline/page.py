@@ -33,6 +33,7 @@ from airl_mav.latency.injection import (
 )
 from airl_mav.latency.stages import f1_knee_hz, f1_velocity, max_acceleration
 from airl_mav.policy.actions import commands
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import InFlight, Kinematics, observe
 from airl_mav.policy.registry import LearnedPolicy
 from airl_mav.profiles.computer import ComputerProfile
@@ -250,7 +251,7 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
         )
         # For policies with memory: the first decision of a flight.
         fresh = policy.with_generator(np.random.default_rng(0)) if card.state else policy
-        chosen = commands(card.actions, fresh.act_batch(fresh.encode(seen)))
+        chosen = commands(card.actions, fresh.act_batch(encode_layout(card.observation, seen)))
         moved = np.abs(chosen[:-1] - chosen[-1]).max(axis=1)
         ignored = np.flatnonzero(moved <= SAME * card.actions.max_speed_m_s)
         reach = ignored[0] if ignored.size else len(depths)
