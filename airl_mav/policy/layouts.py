@@ -393,7 +393,7 @@ class CandidatesLayout(Layout):
         """Return the encoder of one flight."""
         memory = planner.PlannerPolicy(planner.LEARNED)
 
-        def encode(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:  # noqa: ARG001
+        def encode(spec: ObservationSpec, seen: Observation, *_: Shrink) -> Encoded:
             boxes = self.boxes(spec)
             found = memory.candidates(seen.rows(0), features=True)
             told = {

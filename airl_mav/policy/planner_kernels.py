@@ -33,17 +33,23 @@ static, moving and possibly moving obstacles [m]."""
 
 
 @kernel
-def gap_at(gap: Floats, origin: Floats, cell: float, north: float, east: float) -> float:
-    """Return the gap at a position, interpolated on the map (rows, columns)."""
-    rows, columns = gap.shape
-    x = min(max((north - origin[0]) / cell - 0.5, 0.0), rows - 1.001)
-    y = min(max((east - origin[1]) / cell - 0.5, 0.0), columns - 1.001)
+def interpolated(field: Floats, x: float, y: float) -> float:
+    """Return a field (rows, columns) at a row and a column between cells, bilinearly."""
+    rows, columns = field.shape
+    # Just below the last index, so that row + 1 and column + 1 exist.
+    x, y = min(max(x, 0.0), rows - 1.001), min(max(y, 0.0), columns - 1.001)
     row, column = int(x), int(y)
     u, v = x - row, y - column
-    near = (1.0 - v) * gap[row, column] + v * gap[row, column + 1]
-    far = (1.0 - v) * gap[row + 1, column] + v * gap[row + 1, column + 1]
+    near = (1.0 - v) * field[row, column] + v * field[row, column + 1]
+    far = (1.0 - v) * field[row + 1, column] + v * field[row + 1, column + 1]
     found: float = (1.0 - u) * near + u * far
     return found
+
+
+@kernel
+def gap_at(gap: Floats, origin: Floats, cell: float, north: float, east: float) -> float:
+    """Return the gap at a position, interpolated on the map (rows, columns)."""
+    return interpolated(gap, (north - origin[0]) / cell - 0.5, (east - origin[1]) / cell - 0.5)
 
 
 @kernel
@@ -82,7 +88,7 @@ def predict(
         origin: North, east of the map's corner [m].
         cell: Side of a cell [m].
         tracks: (m, 5) moving obstacles: position, velocity, radius.
-        possible: The same of those that may move.
+        possible: The same of possibly moving obstacles.
         wishes: (c, 2) velocities, north, east [m/s].
         straight_on: (k,) times of straight flight [s].
         places: (4, 2) position, velocity, goal, target.

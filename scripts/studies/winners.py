@@ -6,7 +6,7 @@ The paper (V.B, VI.B) selects the best network of each arena and flies it with i
 Raspberry Pi 4. This study takes the best network of each arena of a sweep, and the training of it
 with the highest success. It flies that policy undelayed, with the latency of its network measured
 on this computer and estimated on the Raspberry Pi 4, and with the latency of the paper's network.
-The flights have other seeds than those that selected it. Writes table.json.
+The flights have other seeds than the selection. Writes table.json.
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ from airl_mav.envs.arena_batch import ArenaBatch, relief_of
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay
 from airl_mav.latency.injection import Injection
+from airl_mav.policy.planner_kernels import interpolated
 
 CELLS = 125
 """Maximum number of map cells along an arena's longer side."""
@@ -246,16 +247,8 @@ def _fill_times(
 @kernel
 def read_at(known: Map, field: NDArray[np.float64], north: float, east: float) -> float:
     """Return a field of the map at a position, by bilinear interpolation."""
-    rows, columns = field.shape
-    # Just below the last index, so that row + 1 and column + 1 exist.
-    x = min(max((north - known.north) / known.cell, 0.0), rows - 1.001)
-    y = min(max((east - known.east) / known.cell, 0.0), columns - 1.001)
-    row, column = int(x), int(y)
-    u, v = x - row, y - column
-    near = (1.0 - v) * field[row, column] + v * field[row, column + 1]
-    far = (1.0 - v) * field[row + 1, column] + v * field[row + 1, column + 1]
-    found: float = (1.0 - u) * near + u * far
-    return found
+    x, y = (north - known.north) / known.cell, (east - known.east) / known.cell
+    return interpolated(field, x, y)
 
 
 STEP_S = 0.1
