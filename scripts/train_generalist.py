@@ -74,7 +74,7 @@ class Scorer(nn.Module):
     def forward(
         self, candidates: torch.Tensor, commands: torch.Tensor, costs: torch.Tensor
     ) -> torch.Tensor:
-        """Return the commands (n, 3) of the best of the candidates (n, c, features)."""
+        """Return the commands (n, 4) of the best of the candidates (n, c, features)."""
         total = costs + WEIGHT_S * torch.sigmoid(self.risk(candidates))[..., 0]
         best = total.argmin(dim=1)[:, None, None].expand(-1, 1, commands.shape[2])
         return commands.gather(1, best)[:, 0]
@@ -90,7 +90,7 @@ class Explorer:
         self._left = 0
 
     def decide(self, observation: Any) -> tuple[NDArray[np.float64], NDArray[np.float16]]:
-        """Return the command (3,) and the features of the candidate."""
+        """Return the command (4,) and the features of the candidate."""
         found = self._planner.candidates(observation, features=True)
         if self._left == 0:
             self._left = int(self._rng.integers(3, 15))
@@ -138,7 +138,7 @@ def main() -> int:
             "range_m": 20.0,
             "in_flight": ("command", "latency"),
         },
-        "actions": {"set": "velocity-yaw-rate", "max_speed_m_s": planner.LEARNED.speeds_m_s[-1]},
+        "actions": {"set": "velocity3d-yaw-rate", "max_speed_m_s": planner.LEARNED.speeds_m_s[-1]},
         "hold_s": HOLD_S,
         "goal_radius_m": 3.0,
         "altitude_m": 2.5,
@@ -182,7 +182,7 @@ def fly(
     begin(list(range(SLOTS)))
     while known < decisions:
         looked = navigation.see()
-        chosen = np.zeros((SLOTS, 3))
+        chosen = np.zeros((SLOTS, 4))
         times = navigation.flights().time_s.copy()
         for i in range(SLOTS):
             chosen[i], features = pilots[i].decide(looked.rows(i))

@@ -286,7 +286,7 @@ class EnvironmentSpec(ProfileModel):
     actions: ActionSetName = Field(
         default="arc-25",
         description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw,"
-        " velocity-yaw-rate; with a vertical speed arc3d-75, velocity3d,"
+        " velocity3d-yaw-rate; with a vertical speed arc3d-75, velocity3d,"
         " velocity3d-fixed-yaw; body-rates, with a thrust; or your own as"
         " MODULE:NAME or FILE.py:NAME",
     )

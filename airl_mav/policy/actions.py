@@ -4,10 +4,10 @@ An action is a velocity, or an attitude or body rates with a thrust.
 
 Action sets: `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's
 text. `velocity`: the paper's continuous pair, forward and right speed, the nose turns to the
-course; `velocity-fixed-yaw`: the same pair with a fixed heading; `velocity-yaw-rate`: the same pair
-and a yaw rate. Sets of three dimensions also
-command the vertical speed; the other sets hold an altitude. `velocity3d` and `velocity3d-fixed-yaw`
-are these two with a third number, and `arc3d-75` is `arc-25` climbing, level and sinking.
+course; `velocity-fixed-yaw`: the same pair with a fixed heading. Sets of three dimensions also command the
+vertical speed; the other sets hold an altitude. `velocity3d` and `velocity3d-fixed-yaw` are these
+two with a third number, `velocity3d-yaw-rate` is the pair with a yaw rate and a vertical speed, and
+`arc3d-75` is `arc-25` climbing, level and sinking.
 `body-rates` commands no velocity: three body rates and a collective thrust. Any other name is a
 custom set: a class, constructed without arguments.
 """
@@ -273,7 +273,7 @@ FOLLOW_MAX_RAD_S = math.radians(90.0)
 
 
 MAX_YAW_RATE_RAD_S = math.radians(120.0)
-"""`velocity-yaw-rate`: maximum yaw rate [rad/s]."""
+"""`velocity3d-yaw-rate`: maximum yaw rate [rad/s]."""
 
 
 MAX_RATE_DEG_S = 180.0
@@ -348,9 +348,10 @@ class VelocitySet(ActionSet):
         # Limit the vector's length: a corner of the square is no faster than an edge.
         speed = np.hypot(wanted[:, 0], wanted[:, 1])
         wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
+        climb = fastest_climb(spec.max_speed_m_s)
         if self._yaw_rate:
-            return np.concatenate([wanted, shares[:, 2:] * MAX_YAW_RATE_RAD_S], axis=1)
-        down = shares[:, 2:] * fastest_climb(spec.max_speed_m_s)
+            return np.concatenate([wanted, shares[:, 2:] * (MAX_YAW_RATE_RAD_S, climb)], axis=1)
+        down = shares[:, 2:] * climb
         if self._fixed_yaw:
             return np.concatenate([wanted, np.zeros((len(wanted), 1)), down], axis=1)
         course = np.arctan2(wanted[:, 1], wanted[:, 0])
@@ -427,7 +428,7 @@ ACTION_SETS: dict[str, ActionSet] = {
     "arc3d-75": DiscreteSet(75, _arc_3d, vertical=True),
     "velocity3d": VelocitySet(vertical=True),
     "velocity3d-fixed-yaw": VelocitySet(vertical=True, fixed_yaw=True),
-    "velocity-yaw-rate": VelocitySet(yaw_rate=True),
+    "velocity3d-yaw-rate": VelocitySet(vertical=True, yaw_rate=True),
     BODY_RATES: BodyRateSet(),
 }
 """Shipped action sets by name."""
@@ -491,8 +492,8 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
 
     Discrete actions are (n,) integers from 0 on. Continuous actions are (n, 2): forward and right
     speed, each -1..1 of the maximum, clipped. Sets of three dimensions are (n, 3). The third number
-    is the downward speed as a share of `actions.fastest_climb`; of `velocity-yaw-rate` the yaw rate
-    as a share of `MAX_YAW_RATE_RAD_S`. `body-rates` is (n, 4): roll, pitch
+    is the downward speed as a share of `actions.fastest_climb`. `velocity3d-yaw-rate` is (n, 4): the
+    third number is the yaw rate as a share of `MAX_YAW_RATE_RAD_S`. `body-rates` is (n, 4): roll, pitch
     and yaw rate, each -1..1 of the maximum, and thrust, -1 for zero to 1 for full thrust.
 
     The commands are (n, 3): forward and right [m/s] in the heading frame, and yaw rate [rad/s],

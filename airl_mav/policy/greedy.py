@@ -94,7 +94,13 @@ class GreedyPolicy:
 
 
 def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
-    """Return the returns at flight height as points (n, 2), forward and right of the vehicle [m].
+    """Return the returns at flight height as points (n, 2), forward and right of the vehicle [m]."""
+    points = level_points(observation)
+    return points[np.abs(points[:, 2]) < band_m, :2]
+
+
+def level_points(observation: Observation) -> NDArray[np.float64]:
+    """Return the returns as points (n, 3), forward, right and down from the vehicle [m].
 
     The image is levelled by the vehicle's roll and pitch, so that neither the floor nor the tilt of
     acceleration looks like an obstacle. The camera is assumed at the vehicle's centre, along the
@@ -118,8 +124,7 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     tilted_down = sr * right + cr * down
     forward = cp * ahead + sp * tilted_down
     level_down = -sp * ahead + cp * tilted_down
-    inside = np.abs(level_down) < band_m
-    return np.stack([forward[inside], level_right[inside]], axis=1)
+    return np.stack([forward, level_right, level_down], axis=1)
 
 
 def clearance(points: NDArray[np.float64], heading: float, half_width_m: float) -> float:

@@ -379,7 +379,7 @@ class CandidatesLayout(Layout):
         count = planner.candidate_count(planner.LEARNED.speeds_m_s, fov)
         shapes = {
             "candidates": (count, planner.FEATURES),
-            "commands": (count, 3),
+            "commands": (count, 4),
             "costs": (count,),
         }
         return {key: Box(shape, np.float32, -math.inf, math.inf) for key, shape in shapes.items()}
@@ -504,7 +504,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         its level distance / 20 m. With `goal_height` goal is (n, 4), the last number being the
         distance below the vehicle / 5 m. `paper`: velocity NED [m/s]; goal as north, east [m] and
         distance [m].
-        `candidates`: `candidates` (n, c, features), `commands` (n, c, 3) in shares of the maximum,
+        `candidates`: `candidates` (n, c, features), `commands` (n, c, 4) in shares of the maximum,
         and `costs` (n, c) [s] of `planner.Candidates`, float32, as at first decisions.
         With additional inputs, `in_flight` (n, k) float32, as in `INPUTS`.
         An image of each additional camera as in `body`, for every layout: `grey_down`

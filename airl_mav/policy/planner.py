@@ -1,10 +1,12 @@
 """Planner: a classical policy with a map of its depth images.
 
-A level scan of each image updates an occupancy grid (Elfes, IEEE Computer 22(6), 1989) and tracks
-of moving obstacles. Dijkstra's algorithm finds the path to the goal; unknown cells count as free.
-The policy pursues the most distant point of the path in line of sight. It predicts a set of
-velocities, each with a brake to a stop, and takes the one with the least cost (a dynamic window:
-Fox, Burgard, Thrun, IEEE Robotics & Automation Magazine 4(1), 1997).
+Level scans of each image, one for each height, update an occupancy grid (Elfes, IEEE Computer
+22(6), 1989), and tracks of moving obstacles. Dijkstra's algorithm finds the path to the goal;
+unknown cells count as free. The policy holds its first height unless the path is blocked there: it
+then takes a path that is free at any height, and the height that is free the furthest. It pursues
+the most distant point of the path in line of sight. It predicts a set of velocities, each with a
+brake to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard, Thrun, IEEE
+Robotics & Automation Magazine 4(1), 1997).
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.actions import Action
-from airl_mav.policy.greedy import near_points
+from airl_mav.policy.actions import Action, fastest_climb
+from airl_mav.policy.greedy import level_points
 from airl_mav.policy.observation import Observation
 
 Floats = NDArray[np.float64]
@@ -59,9 +61,10 @@ class PlannerSettings:
     """Returns within this height above or below the vehicle are obstacles."""
 
     @property
-    def limits(self) -> tuple[float, float, float]:
-        """Maximum command: forward, right [m/s], yaw rate [rad/s]."""
-        return self.speeds_m_s[-1], self.speeds_m_s[-1], self.max_yaw_rate_rad_s
+    def limits(self) -> tuple[float, float, float, float]:
+        """Maximum command: forward, right [m/s], yaw rate [rad/s], down [m/s]."""
+        speed = self.speeds_m_s[-1]
+        return speed, speed, self.max_yaw_rate_rad_s, fastest_climb(speed)
 
 
 LEARNED = PlannerSettings(speeds_m_s=(0.6, 1.25, 2.5, 3.75, 5.0, 6.0, 7.0))
@@ -75,6 +78,18 @@ CELLS = 160
 
 CELL_M = 0.4
 """Minimum side of a cell [m]."""
+
+LAYERS, BASE = 7, 3
+"""Layers of a map, the lowest first, and the one at the height of the first decision."""
+
+LAYER_M = 0.5
+"""Distance of layers [m]."""
+
+LOWEST_M = 0.9
+"""Minimum height of a layer above the start [m]."""
+
+CLIMB_M_S, CLIMB_GAIN_1_S = 1.5, 1.0
+"""Maximum vertical speed [m/s], and vertical speed per error of the height [1/s]."""
 
 AROUND = 1.6
 """Side of a map, relative to the distance of the goal along the longer axis."""
@@ -91,19 +106,28 @@ FREE_M = 18.0
 BLOCKED = 1000.0
 """Cost of a metre in an obstacle, relative to free space."""
 
+NARROW = 0.15
+"""Minimum room of a free node."""
+
+DETOUR, DETOUR_M, SHORTER = 1.2, 2.0, 0.8
+"""Cost of a path, relative to the goal's distance and beyond [m], from which other heights are
+tried; their path must cost at most `SHORTER` of it."""
+
 MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 """Moves between nodes of the path: rows, columns."""
 
 
 class OccupancyMap:
-    """Occupancy grid with memory."""
+    """Occupancy grid with memory, in layers of different heights."""
 
     def __init__(self, position: Floats, goal: Floats) -> None:
         """Create an unknown map with position and goal (2,) north, east [m] in its middle."""
         side = max(CELL_M * CELLS, AROUND * float(np.abs(goal - position).max()))
         self.cell = side / CELLS
         self.origin = 0.5 * (position + goal - side)
-        self.evidence = np.zeros((CELLS, CELLS))
+        self.evidence = np.zeros((LAYERS, CELLS, CELLS))
+        self.level = BASE
+        """Layer of the vehicle."""
         self._graph: Any = None
 
     def cells_of(self, points: Floats) -> Cells:
@@ -111,24 +135,47 @@ class OccupancyMap:
         index = np.clip(((points - self.origin) / self.cell).astype(np.int64), 0, CELLS - 1)
         return index[:, 0], index[:, 1]
 
-    def look(self, position: Floats, yaw: float, fov: float, ranges: Floats, hits: Floats) -> None:
-        """Update the evidence by a scan: ranges (b,) [m] over the view, hits (n, 2) [m]."""
-        # A cell is as wide as a bearing in some distance: its neighbours must be free, too.
-        padded = np.pad(np.minimum(ranges, FREE_M), 1)
-        least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-        place, per_rad, limit = (self.origin, self.cell), len(ranges) / fov, least - 0.9 * self.cell
-        _kernels().see_free(self.evidence, *place, position, yaw - 0.5 * fov, per_rad, limit, LEAST)
-        hit = self.cells_of(hits)
-        self.evidence[hit] = np.minimum(MOST, self.evidence[hit] + 1.0)
+    def look(
+        self,
+        position: Floats,
+        yaw: float,
+        fov: float,
+        ranges: Floats,
+        above: Floats,
+        nearest: Floats,
+        hits: Sequence[Floats],
+    ) -> None:
+        """Update the evidence by scans: ranges (l, b) [m] over the view, hits (n, 2) of each [m].
 
-    def gaps(self, hits: Floats, reach_m: float) -> Floats:
-        """Return the distances of all cells to the nearest obstacle [m], up to about `reach_m`.
+        `above` (l,) are the heights of the layers above the vehicle [m], and `nearest` (l,) the
+        ranges [m] from which they are in view.
+        """
+        # A cell is as wide as a bearing in some distance: its neighbours must be free, too.
+        padded = np.pad(np.minimum(ranges, FREE_M), ((0, 0), (1, 1)))
+        limit = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
+        limit -= 0.9 * self.cell
+        # A return in a layer between covers what is behind it on the same lines of sight.
+        away = np.abs(above)
+        for step in (1, -1):
+            for layer in range(self.level + 2 * step, LAYERS if step > 0 else -1, step):
+                for between in range(self.level + step, layer, step):
+                    share = away[layer] / (away[between] + 0.5 * LAYER_M)
+                    np.minimum(limit[layer], share * padded[between, 1:-1], out=limit[layer])
+        place, per_rad = (self.origin, self.cell, position), limit.shape[1] / fov
+        seen = (limit, nearest, LEAST)
+        _kernels().see_free(self.evidence, *place, yaw - 0.5 * fov, per_rad, *seen)
+        for evidence, each in zip(self.evidence, hits, strict=True):
+            hit = self.cells_of(each)
+            evidence[hit] = np.minimum(MOST, evidence[hit] + 1.0)
+
+    def gaps(self, layer: int, hits: Floats, reach_m: float) -> Floats:
+        """Return the distances of a layer's cells to obstacles [m], up to about `reach_m`.
 
         A distance transform in two passes (Felzenszwalb, Huttenlocher, Theory of Computing 8).
         The newest `hits` (n, 2) are obstacles, even if their cells were free.
         """
         reach = math.ceil(reach_m / self.cell)
-        square = np.where(self.evidence > 0.0, 0.0, (reach + 1.0) ** 2)
+        square = np.where(self.evidence[layer] > 0.0, 0.0, (reach + 1.0) ** 2)
         square[self.cells_of(hits)] = 0.0
         _kernels().fill_gaps(square, reach)
         return np.sqrt(square) * self.cell
@@ -140,14 +187,21 @@ class OccupancyMap:
         found = gap[self.cells_of(start + share[:, None] * (end - start))]
         return bool((found >= min(room_m, found[0])).all())
 
-    def path(self, position: Floats, goal: Floats, gap: Floats, s: PlannerSettings) -> Floats:
-        """Return the path of least cost to the goal (n, 2) [m]."""
-        csgraph, csr_matrix = _search()
+    def room(self, gap: Floats, s: PlannerSettings) -> Floats:
+        """Return the room of the path's nodes: 0 at the vehicle's radius, 1 at the comfort."""
         half = CELLS // 2
         # A node is two by two cells: the largest gap counts, so that a narrow door stays open.
         wide = gap.reshape(half, 2, half, 2).max(axis=(1, 3))
-        room = (wide - s.radius_m) / (s.comfort_m - s.radius_m)
-        cost = np.where(room < 0.15, BLOCKED, 1.0 / np.clip(room, 0.25, 1.0))
+        return np.asarray((wide - s.radius_m) / (s.comfort_m - s.radius_m))
+
+    def path(
+        self, position: Floats, goal: Floats, gap: Floats, s: PlannerSettings
+    ) -> tuple[Floats, float]:
+        """Return the path of least cost to the goal (n, 2) [m], and its cost [m]."""
+        csgraph, csr_matrix = _search()
+        half = CELLS // 2
+        room = self.room(gap, s)
+        cost = np.where(room < NARROW, BLOCKED, 1.0 / np.clip(room, 0.25, 1.0))
         ids = np.arange(half * half).reshape(half, half)
         weights, links = [], []
         for down, right in MOVES:
@@ -175,7 +229,7 @@ class OccupancyMap:
         self._graph.data = weight[self._order]
         (row, end_row), (column, end_column) = self.cells_of(np.stack([position, goal]))
         end = int(ids[end_row // 2, end_column // 2])
-        _, following = csgraph.dijkstra(
+        costs, following = csgraph.dijkstra(
             self._graph, directed=False, indices=np.array(end), return_predecessors=True
         )
         nodes = [int(ids[row // 2, column // 2])]
@@ -184,7 +238,7 @@ class OccupancyMap:
         at = np.stack(np.divmod(np.array(nodes), half), axis=1)
         points = self.origin + (at + 0.5) * 2.0 * self.cell
         points[-1] = goal
-        return np.asarray(points)
+        return points, float(costs[nodes[0]])
 
 
 TRACKED_M = 14.0
@@ -260,7 +314,7 @@ def follow(
     for first, last, whole in _groups(points, ranges):
         part = points[first:last]
         width = float(np.hypot(*np.ptp(part, axis=0)))
-        evidence = known.evidence[known.cells_of(part)]
+        evidence = known.evidence[known.level][known.cells_of(part)]
         # The visible part of an obstacle in free space is enough: it came from elsewhere.
         if not whole and (evidence < 0.0).mean() < 0.5:
             continue
@@ -355,6 +409,8 @@ class Hold(NamedTuple):
     """Yaw rate of the setpoint [rad/s]."""
     last_turn: float
     """Yaw rate of the previous one [rad/s]."""
+    level_s: float = 0.0
+    """Time until the vehicle is at its new height [s]."""
 
 
 class Candidates(NamedTuple):
@@ -363,7 +419,7 @@ class Candidates(NamedTuple):
     velocities: Floats
     """(c, 2) north, east [m/s]."""
     commands: Floats
-    """(c, 3) forward, right [m/s], yaw rate [rad/s]."""
+    """(c, 4) forward, right [m/s], yaw rate [rad/s], down [m/s]."""
     costs: Floats
     """(c,) costs of the planner [s]."""
     features: Floats
@@ -394,6 +450,8 @@ class PlannerPolicy:
         _search()
         _kernels()
         self._map: OccupancyMap | None = None
+        self._heights_m = np.zeros(LAYERS)
+        """Heights of the layers above the start."""
         self._tracks: list[Track] = []
         self._time_us: int | None = None
         self._last = np.zeros(2)
@@ -425,31 +483,48 @@ class PlannerPolicy:
             nose += ahead_s * float(told.command[2])
         position = np.asarray(state.position[:2], np.float64)
         goal = position + to_world @ observation.goal
-        self._map = self._map or OccupancyMap(position, goal)
+        height_m = -float(state.position[2])
+        if self._map is None:
+            self._map = OccupancyMap(position, goal)
+            self._heights_m = height_m + LAYER_M * (np.arange(LAYERS) - BASE)
+        above = self._heights_m - height_m
+        self._map.level = int(np.abs(above).argmin())
         # A bearing is wider than any column, so that a wall leaves none empty.
-        ranges = scan(near_points(observation, s.band_m), fov, int(fov * lens.focal / 1.1))
-        angle = yaw + (np.arange(len(ranges)) + 0.5) * (fov / len(ranges)) - 0.5 * fov
+        ranges = scan(level_points(observation), above, s.band_m, fov, int(fov * lens.focal / 1.1))
+        bearings = ranges.shape[1]
+        angle = yaw + (np.arange(bearings) + 0.5) * (fov / bearings) - 0.5 * fov
+        ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         seen = np.isfinite(ranges)
-        points = np.full((len(ranges), 2), np.inf)
-        ray = np.stack([np.cos(angle[seen]), np.sin(angle[seen])], axis=1)
-        points[seen] = position + ranges[seen, None] * ray
+        points = position + ranges[..., None] * ray
         elapsed_s = self._elapsed(state.time_us, s.period_s if told is None else held_s)
-        self._tracks, moving = follow(self._tracks, self._map, points, ranges, elapsed_s)
-        hits = points[seen & ~moving]
-        self._map.look(position, yaw, fov, ranges, hits)
-        gap = self._map.gaps(hits, s.comfort_m)
-        target = self._target(self._map, position, goal, gap)
+        now = self._map.level
+        self._tracks, moving = follow(self._tracks, self._map, points[now], ranges[now], elapsed_s)
+        # Higher and lower parts of what moves are no obstacles, either.
+        beside = (ranges > ranges[now] - WIDEST_M) & (ranges < ranges[now] + WIDEST_M)
+        still = seen & ~(moving & beside)
+        hits = [each[rows] for each, rows in zip(points, still, strict=True)]
+        upright, half = float(observation.pitch), math.atan2(0.5 * lens.height, lens.focal)
+        nearest = nearest_in_view(above, upright + half, upright - half)
+        nearest[now] = 0.0
+        self._map.look(position, yaw, fov, ranges, above, nearest, hits)
+        target, level, gaps = self._way(self._map, position, goal, hits)
         velocity = to_world @ observation.velocity[:2]
         bearing = math.atan2(target[1] - position[1], target[0] - position[0])
         wishes = self._wishes(bearing, yaw, fov, latency_s)
         places = Places(position, velocity, goal, target)
         turn = self._turn(bearing - nose, held_s)
-        hold = Hold(s.dead_time_s + ahead_s, held_s, turn, 0.0 if told is None else told.command[2])
-        outcomes = self._outcomes(self._map, gap, wishes, hold, places)
+        last_turn = 0.0 if told is None else float(told.command[2])
+        rise_s = max(0.0, abs(float(above[level])) - 0.5 * LAYER_M) / CLIMB_M_S
+        lead_s = s.dead_time_s + ahead_s
+        hold = Hold(lead_s, held_s, turn, last_turn, lead_s + s.response_s + rise_s)
+        outcomes = self._outcomes(self._map, level, gaps, wishes, hold, places)
         # The velocity turns with the nose during the hold: aim so that the mean course is right.
         mean = nose + 0.5 * turn * held_s
         c, d, (north, east) = math.cos(mean), math.sin(mean), wishes.T
-        commands = [c * north + d * east, c * east - d * north, np.full(len(wishes), turn)]
+        gain = min(CLIMB_GAIN_1_S, 0.5 / held_s)
+        down = max(-CLIMB_M_S, min(CLIMB_M_S, -gain * float(above[level])))
+        alike = [np.full(len(wishes), each) for each in (turn, down)]
+        commands = [c * north + d * east, c * east - d * north, *alike]
         numbers = np.zeros((len(wishes), 0))
         if features:
             numbers = self._features(wishes, outcomes, latency_s, places, np.array([bearing, yaw]))
@@ -473,13 +548,60 @@ class PlannerPolicy:
         gain = min(self._settings.turn_gain_1_s, 1.0 / held_s)
         return max(-limit, min(limit, gain * angle))
 
-    def _target(self, known: OccupancyMap, position: Floats, goal: Floats, gap: Floats) -> Floats:
+    def _way(
+        self, known: OccupancyMap, position: Floats, goal: Floats, hits: Sequence[Floats]
+    ) -> tuple[Floats, int, Floats]:
+        """Return the pursued point, the layer to fly in, and the gaps (2, rows, columns).
+
+        The gaps are of the layer of the vehicle, and of that to fly in.
+        """
+        s, here = self._settings, known.cells_of(position[None])
+        gaps: dict[int, Floats] = {}
+
+        def gap_in(layer: int) -> Floats:
+            if layer not in gaps:
+                gaps[layer] = known.gaps(layer, hits[layer], s.comfort_m)
+            return gaps[layer]
+
+        def reach(step: int) -> list[int]:
+            """Return the layers that the vehicle reaches upwards (1) or downwards (-1)."""
+            found = []
+            for layer in range(known.level + step, LAYERS if step > 0 else -1, step):
+                low = self._heights_m[layer] < min(LOWEST_M, self._heights_m[BASE])
+                if low or gap_in(layer)[here][0] < s.radius_m + s.margin_m:
+                    break
+                found.append(layer)
+            return found
+
+        now = known.level
+        level = BASE if now == BASE or BASE in reach(int(math.copysign(1, BASE - now))) else now
+        room_m = s.radius_m + s.margin_m + 0.1
+        if known.is_clear(gap_in(level), position, goal, room_m):
+            return goal, level, np.stack([gap_in(now), gap_in(level)])
+        path, cost = known.path(position, goal, gap_in(level), s)
+        if cost > DETOUR * float(np.hypot(*(goal - position))) + DETOUR_M:
+            reached = [now, *reach(1), *reach(-1)]
+            widest = np.max([gap_in(layer) for layer in range(LAYERS)], axis=0)
+            over, less = known.path(position, goal, widest, s)
+            if less < SHORTER * cost:
+                rows, columns = known.cells_of(over)
+                nodes = rows // 2, columns // 2
+                # The first point is the vehicle's.
+                room = np.array([known.room(gap_in(layer), s)[nodes][1:] for layer in reached])
+                clear = np.logical_and.accumulate(room >= NARROW, axis=1)
+                furthest = clear.any(axis=0)
+                off = np.array([abs(layer - now) for layer in reached])
+                lost = np.where(clear, 1.0 - np.clip(room, 0.0, 1.0), 2.0)[:, furthest]
+                level = reached[int((lost.sum(axis=1) + 0.3 * off).argmin())]
+                path = over
+        return self._target(known, position, path, gap_in(level)), level, np.stack(
+            [gap_in(now), gap_in(level)]
+        )
+
+    def _target(self, known: OccupancyMap, position: Floats, path: Floats, gap: Floats) -> Floats:
         """Return the pursued point: the most distant one of the path in line of sight."""
         s = self._settings
         room_m = s.radius_m + s.margin_m + 0.1
-        if known.is_clear(gap, position, goal, room_m):
-            return goal
-        path = known.path(position, goal, gap, s)
         # Never the point next to the vehicle: it would stop there.
         best, *further = path[min(3, len(path) - 1) :]
         for point in further[:: max(1, len(path) // 40)]:
@@ -503,7 +625,13 @@ class PlannerPolicy:
         return np.concatenate([np.zeros((1, 2)), *moves])
 
     def _outcomes(
-        self, known: OccupancyMap, gap: Floats, wishes: Floats, hold: Hold, places: Places
+        self,
+        known: OccupancyMap,
+        level: int,
+        gaps: Floats,
+        wishes: Floats,
+        hold: Hold,
+        places: Places,
     ) -> Floats:
         """Return the outcomes (8, k, c) of velocities (c, 2), for k times of straight flight.
 
@@ -516,7 +644,7 @@ class PlannerPolicy:
         margin_m = s.margin_m + DRIFT_M_S * (hold.held_s - s.period_s)
         body = (s.radius_m, margin_m, s.response_s, s.brake_m_s2, s.speeds_m_s[-1])
         _kernels().predict(
-            *(gap, known.evidence, known.origin, known.cell),
+            *(gaps, known.evidence[level], known.origin, known.cell),
             *(_rows(track for track in self._tracks if getattr(track, kind)) for kind in KINDS),
             *(wishes, STRAIGHT_ON_S, np.array(places), self._last),
             *(np.array([*hold, s.dead_time_s]), np.array(body), found),
@@ -575,11 +703,20 @@ def _rows(tracks: Iterable[Track]) -> Floats:
     return np.array(rows, np.float64).reshape(-1, 5)
 
 
-def scan(points: Floats, fov: float, bearings: int) -> Floats:
-    """Return the nearest range [m] of each bearing; points are (n, 2), forward and right [m]."""
-    angle = np.arctan2(points[:, 1], points[:, 0]) + 0.5 * fov
-    bearing = np.floor(angle * (bearings / fov)).astype(np.int64)
-    inside = (bearing >= 0) & (bearing < bearings)
-    found = np.full(bearings, np.inf)
-    np.minimum.at(found, bearing[inside], np.hypot(points[inside, 0], points[inside, 1]))
-    return found
+def scan(points: Floats, above: Floats, band_m: float, fov: float, bearings: int) -> Floats:
+    """Return the nearest ranges (l, bearings) [m] in layers at heights `above` (l,) the vehicle.
+
+    Points are (n, 3), forward, right, down [m]; those within `band_m` of a layer's height count.
+    """
+    ranges = np.full((len(above), bearings), np.inf)
+    _kernels().scan_layers(points, above, band_m, fov, ranges)
+    return ranges
+
+
+def nearest_in_view(above: Floats, upper: float, lower: float) -> Floats:
+    """Return the ranges (l,) [m] from which heights above the vehicle are in view.
+
+    `upper` and `lower` are the elevations of the view's edges [rad].
+    """
+    edge = np.where(above > 0.0, math.tan(max(upper, 1e-3)), math.tan(min(lower, -1e-3)))
+    return np.asarray(above / edge)

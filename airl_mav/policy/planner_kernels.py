@@ -66,7 +66,7 @@ def _gap_to(tracks: Floats, north: float, east: float, t: float, radius: float) 
 
 @kernel
 def predict(
-    gap: Floats,
+    gaps: Floats,
     evidence: Floats,
     origin: Floats,
     cell: float,
@@ -83,8 +83,9 @@ def predict(
     """Predict velocities, each held, then straight on for a while, then braked to a stop.
 
     Args:
-        gap: (rows, columns) distances to static obstacles [m].
-        evidence: (rows, columns) of the map; 0 = unknown.
+        gaps: (2, rows, columns) distances to static obstacles [m], at the vehicle's height and at
+            the height to which it goes.
+        evidence: (rows, columns) of the map at that height; 0 = unknown.
         origin: North, east of the map's corner [m].
         cell: Side of a cell [m].
         tracks: (m, 5) moving obstacles: position, velocity, radius.
@@ -93,7 +94,8 @@ def predict(
         straight_on: (k,) times of straight flight [s].
         places: (4, 2) position, velocity, goal, target.
         last: (2,) previous velocity.
-        hold: Lead and hold [s], yaw rate and previous yaw rate [rad/s], dead time [s].
+        hold: Lead and hold [s], yaw rate and previous yaw rate [rad/s], time until the height is
+            reached [s], dead time [s].
         body: Radius, margin [m], time constant of the velocity [s], acceleration [m/s2], speed to
             the target [m/s].
         found: (8, k, c) outcomes, written.
@@ -103,20 +105,20 @@ def predict(
     share = 1.0 - math.exp(-STEP_S / response_s)
     steps = math.ceil((end + straight_on[-1] + BRAKING_S) / STEP_S)
     # Too close already: only getting closer is a collision.
-    here = gap_at(gap, origin, cell, places[0, 0], places[0, 1])
+    here = gap_at(gaps[0], origin, cell, places[0, 0], places[0, 1])
     least = min(margin, here - radius - 0.05)
     for k in range(len(straight_on)):
         for c in range(len(wishes)):
             x, y, vx, vy = places[0, 0], places[0, 1], places[1, 0], places[1, 1]
             cost, hit_s, unknown, flown = 0.0, math.inf, 0, 0
-            gaps = (2.0, 3.0, 3.0)
+            least_m = (2.0, 3.0, 3.0)
             there = False
             for step in range(1, steps + 1):
                 t = step * STEP_S
                 # Setpoints turn with the nose.
                 north, east, angle = 0.0, 0.0, 0.0
                 if t <= lead:
-                    north, east, angle = last[0], last[1], hold[3] * (t - hold[4])
+                    north, east, angle = last[0], last[1], hold[3] * (t - hold[5])
                 elif t <= end + straight_on[k]:
                     north, east = wishes[c, 0], wishes[c, 1]
                     angle = hold[2] * (min(t, end) - 0.5 * (lead + end))
@@ -128,10 +130,11 @@ def predict(
                 x, y = x + STEP_S * vx, y + STEP_S * vy
                 if there:
                     continue
-                static = gap_at(gap, origin, cell, x, y) - radius
+                static = gap_at(gaps[int(t >= hold[4])], origin, cell, x, y) - radius
                 moving = _gap_to(tracks, x, y, t, radius)
                 maybe = _gap_to(possible, x, y, t, radius)
-                gaps = (min(gaps[0], static), min(gaps[1], moving), min(gaps[2], maybe))
+                near, close, perhaps = least_m
+                least_m = min(near, static), min(close, moving), min(perhaps, maybe)
                 row = min(max(int((x - origin[0]) / cell), 0), len(evidence) - 1)
                 column = min(max(int((y - origin[1]) / cell), 0), len(evidence) - 1)
                 unknown, flown = unknown + (evidence[row, column] == 0.0), flown + 1
@@ -141,14 +144,14 @@ def predict(
                     cost, hit_s = 1000.0 - 100.0 * t - 30.0 * max(depth, -3.0), t
                     there = True
                     continue
-                near = 2.0 * max(0.0, NEAR_M - moving) + max(0.0, CLOSE_M - static)
-                cost += STEP_S * (1.0 + near)
+                charge = 2.0 * max(0.0, NEAR_M - moving) + max(0.0, CLOSE_M - static)
+                cost += STEP_S * (1.0 + charge)
                 there = math.hypot(x - places[2, 0], y - places[2, 1]) < ARRIVED_M
             left = math.hypot(x - places[3, 0], y - places[3, 1]) / speed
             found[COST, k, c] = cost if there else cost + left
             found[HIT_S, k, c], found[FLOWN, k, c], found[LEFT, k, c] = hit_s, cost, left
             found[UNKNOWN, k, c] = unknown / max(flown, 1)
-            found[STATIC_M, k, c], found[MOVING_M, k, c], found[POSSIBLE_M, k, c] = gaps
+            found[STATIC_M, k, c], found[MOVING_M, k, c], found[POSSIBLE_M, k, c] = least_m
 
 
 @kernel
@@ -182,30 +185,59 @@ def see_free(
     first: float,
     per_rad: float,
     limit: Floats,
+    nearest: Floats,
     lowest: float,
 ) -> None:
-    """Lower the evidence of cells in front of the returns.
+    """Lower the evidence (l, rows, columns) of cells in front of the returns.
 
-    `limit` (b,) are the free ranges of bearings from `first` [rad] on, `per_rad` in a radian.
+    `limit` (l, b) are the free ranges of bearings from `first` [rad] on, `per_rad` in a radian,
+    `nearest` (l,) the ranges from which the layers are in view.
     """
     furthest = limit.max()
-    for row in range(len(evidence)):
+    for row in range(evidence.shape[1]):
         north = origin[0] + (row + 0.5) * cell - position[0]
-        for column in range(len(evidence)):
+        for column in range(evidence.shape[2]):
             east = origin[1] + (column + 0.5) * cell - position[1]
             away = math.sqrt(north * north + east * east)
             if away >= furthest:
                 continue
             bearing = int(((math.atan2(east, north) - first) % (2.0 * math.pi)) * per_rad)
-            if bearing < len(limit) and away < limit[bearing]:
-                evidence[row, column] = max(lowest, evidence[row, column] - 1.0)
+            if bearing >= limit.shape[1]:
+                continue
+            for layer in range(len(limit)):
+                if nearest[layer] <= away < limit[layer, bearing]:
+                    before = evidence[layer, row, column]
+                    evidence[layer, row, column] = max(lowest, before - 1.0)
+
+
+@kernel
+def scan_layers(
+    points: Floats, above: Floats, band: float, fov: float, ranges: Floats
+) -> None:
+    """Reduce ranges (l, b) [m] to the nearest points of each layer and bearing.
+
+    `points` (n, 3) are forward, right and down [m]; `above` (l,) are the heights of the layers
+    above the vehicle, each seen in a band of +- `band` [m].
+    """
+    layers, bearings = ranges.shape
+    for k in range(len(points)):
+        angle = math.atan2(points[k, 1], points[k, 0]) + 0.5 * fov
+        bearing = int(math.floor(angle * (bearings / fov)))
+        if not 0 <= bearing < bearings:
+            continue
+        away = math.hypot(points[k, 0], points[k, 1])
+        for layer in range(layers):
+            if abs(points[k, 2] + above[layer]) < band:
+                ranges[layer, bearing] = min(ranges[layer, bearing], away)
 
 
 def warm_up() -> None:
     """Compile all functions, or load them from the cache."""
     square, pair, none = np.zeros((4, 4)), np.zeros(2), np.zeros((0, 5))
     fill_gaps(square, 1)
-    see_free(square, pair, 1.0, pair, 0.0, 1.0, np.ones(1), 0.0)
-    still, tables = np.zeros((1, 2)), (square, square, pair, 1.0, none, none)
-    hold, body, found = np.zeros(5), np.ones(5), np.zeros((8, 1, 1))
+    one = np.ones((1, 1))
+    see_free(square[None], pair, 1.0, pair, 0.0, 1.0, one, np.ones(1), 0.0)
+    scan_layers(np.zeros((1, 3)), np.zeros(1), 1.0, 1.0, one)
+    still, tables = np.zeros((1, 2)), (square[None], square, pair, 1.0, none, none)
+    hold, body, found = np.zeros(6), np.ones(5), np.zeros((8, 1, 1))
     predict(*tables, still, np.zeros(1), np.zeros((4, 2)), pair, hold, body, found)

@@ -188,7 +188,7 @@ class ExportRequest(BaseModel):
     )
     actions: Annotated[ActionSetName | None, COMMON] = optional(
         "action set that the model was trained with: arc-25, paper-25, velocity,"
-        " velocity-fixed-yaw, velocity-yaw-rate, arc3d-75, velocity3d,"
+        " velocity-fixed-yaw, velocity3d-yaw-rate, arc3d-75, velocity3d,"
         " velocity3d-fixed-yaw, body-rates, or your own as MODULE:NAME or FILE.py:NAME; by default"
         " arc-25, or velocity where a .zip has continuous actions, velocity3d where they are three,"
         " body-rates where they are four"

@@ -51,7 +51,7 @@ _MAKERS = {
 _ACTIONS = {
     "arc-25": "arcs",
     "velocity": "continuous",
-    "velocity-yaw-rate": "planner's candidates",
+    "velocity3d-yaw-rate": "planner's candidates",
     "velocity3d-fixed-yaw": "continuous, with a climb",
     "body-rates": "body rates and thrust",
 }

@@ -95,7 +95,7 @@ def test_with_fixed_yaw_it_flies_the_same_way_and_never_turns(
 def test_with_a_yaw_rate_it_flies_the_same_way_and_turns_as_asked(
     action: tuple[float, float, float],
 ) -> None:
-    turning = commands(spec("velocity-yaw-rate"), np.array([action]))
+    turning = commands(spec("velocity3d-yaw-rate"), np.array([action]))
     np.testing.assert_array_equal(turning[:, :2], fly(action[:2])[:, :2])
     assert turning[0, 2] == pytest.approx(math.radians(120.0) * min(1.0, max(-1.0, action[2])))
 
