@@ -40,8 +40,12 @@ ARENAS = {
     "dense-obstacles": ("1ms", "normal:250ms,50ms", "normal:500ms,100ms"),
     "training/passage": ("1ms", "normal:250ms,50ms"),
     "rooms": ("1ms",),
+    "gates": ("1ms",),
 }
 """Latencies by arena; each episode draws one."""
+
+SPREAD = {"mass": 0.15, "thrust": 0.1, "drag": 0.5, "rotor_lag": 0.3}
+"""Largest differences of the vehicle, as shares."""
 
 SLOTS = 24
 """Parallel flights in an arena."""
@@ -162,7 +166,8 @@ def fly(
 ) -> tuple[NDArray[np.float16], NDArray[np.float32], int]:
     """Fly an arena; return features (n, FEATURES), risks (n,) and the last seed."""
     told = {"arena": arena, "in_flight": ("command", "latency"), "episode": {"hold_s": HOLD_S}}
-    spec = fields.validated(EnvironmentSpec, told | {"delay": {"latency": latencies}})
+    drawn = {"delay": {"latency": latencies}, "randomisation": SPREAD}
+    spec = fields.validated(EnvironmentSpec, told | drawn)
     navigation, rng = Navigation(spec, SLOTS), np.random.default_rng([seed, first_seed])
     pilots: list[Explorer] = [Explorer(rng)] * SLOTS
     rows: list[list[NDArray[np.float16]]] = [[] for _ in range(SLOTS)]
