@@ -4,10 +4,10 @@ An action is a velocity, or an attitude or body rates with a thrust.
 
 Action sets: `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's
 text. `velocity`: the paper's continuous pair, forward and right speed, the nose turns to the
-course; `velocity-fixed-yaw`: the same pair with a fixed heading. Sets of three dimensions also command the
-vertical speed; the other sets hold an altitude. `velocity3d` and `velocity3d-fixed-yaw` are these
-two with a third number, `velocity3d-yaw-rate` is the pair with a yaw rate and a vertical speed, and
-`arc3d-75` is `arc-25` climbing, level and sinking.
+course; `velocity-fixed-yaw`: the same pair with a fixed heading. Sets of three dimensions
+also command the vertical speed; the other sets hold an altitude. `velocity3d` and
+`velocity3d-fixed-yaw` are these two with a third number, `velocity3d-yaw-rate` is the pair with a
+yaw rate and a vertical speed, and `arc3d-75` is `arc-25` climbing, level and sinking.
 `body-rates` commands no velocity: three body rates and a collective thrust. Any other name is a
 custom set: a class, constructed without arguments.
 """
@@ -491,10 +491,11 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     """Return the commands of n actions.
 
     Discrete actions are (n,) integers from 0 on. Continuous actions are (n, 2): forward and right
-    speed, each -1..1 of the maximum, clipped. Sets of three dimensions are (n, 3). The third number
-    is the downward speed as a share of `actions.fastest_climb`. `velocity3d-yaw-rate` is (n, 4): the
-    third number is the yaw rate as a share of `MAX_YAW_RATE_RAD_S`. `body-rates` is (n, 4): roll, pitch
-    and yaw rate, each -1..1 of the maximum, and thrust, -1 for zero to 1 for full thrust.
+    speed, each -1..1 of the maximum, clipped. Sets of three dimensions are (n, 3). The third
+    number is the downward speed as a share of `actions.fastest_climb`. `velocity3d-yaw-rate` is
+    (n, 4): the third number is the yaw rate as a share of `MAX_YAW_RATE_RAD_S`, the fourth the
+    downward speed. `body-rates` is (n, 4): roll, pitch and yaw rate, each -1..1 of the maximum, and
+    thrust, -1 for zero to 1 for full thrust.
 
     The commands are (n, 3): forward and right [m/s] in the heading frame, and yaw rate [rad/s],
     clockwise positive. Sets of three dimensions append the downward speed [m/s]. `body-rates`

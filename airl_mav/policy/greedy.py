@@ -94,7 +94,7 @@ class GreedyPolicy:
 
 
 def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
-    """Return the returns at flight height as points (n, 2), forward and right of the vehicle [m]."""
+    """Return the returns at flight height as points (n, 2), forward and right [m]."""
     points = level_points(observation)
     return points[np.abs(points[:, 2]) < band_m, :2]
 

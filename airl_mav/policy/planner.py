@@ -1,11 +1,11 @@
 """Planner: a classical policy with a map of its depth images.
 
 Level scans of each image, one for each height, update an occupancy grid (Elfes, IEEE Computer
-22(6), 1989), and tracks of moving obstacles. Dijkstra's algorithm finds the path to the goal;
-unknown cells count as free. The policy holds its first height unless the path is blocked there: it
-then takes a path that is free at any height, and the height that is free the furthest. It pursues
-the most distant point of the path in line of sight. It predicts a set of velocities, each with a
-brake to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard, Thrun, IEEE
+22(6), 1989), and tracks of moving obstacles. A* finds the path to the goal; unknown cells count as
+free. The policy holds its first height unless the path is blocked or long there: it then takes a path
+that is free at some height everywhere, and the height that is free the furthest. It pursues the
+most distant point of the path in line of sight. It predicts a set of velocities, each with a brake
+to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard, Thrun, IEEE
 Robotics & Automation Magazine 4(1), 1997).
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, reduce
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -113,9 +113,6 @@ DETOUR, DETOUR_M, SHORTER = 1.2, 2.0, 0.8
 """Cost of a path, relative to the goal's distance and beyond [m], from which other heights are
 tried; their path must cost at most `SHORTER` of it."""
 
-MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
-"""Moves between nodes of the path: rows, columns."""
-
 
 class OccupancyMap:
     """Occupancy grid with memory, in layers of different heights."""
@@ -128,7 +125,6 @@ class OccupancyMap:
         self.evidence = np.zeros((LAYERS, CELLS, CELLS))
         self.level = BASE
         """Layer of the vehicle."""
-        self._graph: Any = None
 
     def cells_of(self, points: Floats) -> Cells:
         """Return the cells of points (n, 2); those outside count to the border."""
@@ -189,56 +185,22 @@ class OccupancyMap:
 
     def room(self, gap: Floats, s: PlannerSettings) -> Floats:
         """Return the room of the path's nodes: 0 at the vehicle's radius, 1 at the comfort."""
-        half = CELLS // 2
         # A node is two by two cells: the largest gap counts, so that a narrow door stays open.
-        wide = gap.reshape(half, 2, half, 2).max(axis=(1, 3))
+        rows = np.maximum(gap[::2], gap[1::2])
+        wide = np.maximum(rows[:, ::2], rows[:, 1::2])
         return np.asarray((wide - s.radius_m) / (s.comfort_m - s.radius_m))
 
     def path(
         self, position: Floats, goal: Floats, gap: Floats, s: PlannerSettings
     ) -> tuple[Floats, float]:
         """Return the path of least cost to the goal (n, 2) [m], and its cost [m]."""
-        csgraph, csr_matrix = _search()
-        half = CELLS // 2
-        room = self.room(gap, s)
+        half, room = CELLS // 2, self.room(gap, s)
         cost = np.where(room < NARROW, BLOCKED, 1.0 / np.clip(room, 0.25, 1.0))
-        ids = np.arange(half * half).reshape(half, half)
-        weights, links = [], []
-        for down, right in MOVES:
-            # A knight's move passes between two nodes, which count, too.
-            aside = int(math.copysign(1, right))
-            knight = {1: [(0, aside), (1, aside)], 2: [(1, 0), (1, aside)]}
-            on_way = [(0, 0), (down, right), *(knight[down] if abs(right) + down == 3 else [])]
-            first = max(0, -right)
-            windows = [
-                (slice(r, half - down + r), slice(first + c, first + c + half - abs(right)))
-                for r, c in on_way
-            ]
-            length = math.hypot(down, right) * 2.0 * self.cell / len(on_way)
-            passed = np.stack([cost[each] for each in windows])
-            weights.append(length * passed.sum(axis=0).ravel())
-            if self._graph is None:
-                links.append((ids[windows[0]].ravel(), ids[windows[1]].ravel()))
-        weight = np.concatenate(weights)
-        if self._graph is None:
-            source, sink = (np.concatenate(each) for each in zip(*links, strict=True))
-            # Its numbers tell the order of the links.
-            self._graph = csr_matrix((np.arange(len(weight)), (source, sink)), (half**2, half**2))
-            self._order = self._graph.data.copy()
-            self._graph = self._graph.astype(np.float64)
-        self._graph.data = weight[self._order]
-        (row, end_row), (column, end_column) = self.cells_of(np.stack([position, goal]))
-        end = int(ids[end_row // 2, end_column // 2])
-        costs, following = csgraph.dijkstra(
-            self._graph, directed=False, indices=np.array(end), return_predecessors=True
-        )
-        nodes = [int(ids[row // 2, column // 2])]
-        while (node := int(following[nodes[-1]])) >= 0:
-            nodes.append(node)
-        at = np.stack(np.divmod(np.array(nodes), half), axis=1)
-        points = self.origin + (at + 0.5) * 2.0 * self.cell
+        rows, columns = self.cells_of(np.stack([position, goal]))
+        nodes, total = _kernels().find_path(cost, *(rows // 2 * half + columns // 2).tolist())
+        points = self.origin + (np.stack(np.divmod(nodes, half), axis=1) + 0.5) * 2.0 * self.cell
         points[-1] = goal
-        return points, float(costs[nodes[0]])
+        return points, 2.0 * self.cell * total
 
 
 TRACKED_M = 14.0
@@ -368,15 +330,6 @@ STRAIGHT_ON_S = np.array([0.0, 0.6, 1.5])
 """Times of straight flight before the vehicle brakes in the prediction [s]."""
 
 
-def _search() -> tuple[Any, Any]:
-    """Return scipy's `csgraph` and `csr_matrix`. Raises UsageError without scipy."""
-    try:
-        from scipy.sparse import csgraph, csr_matrix
-    except ImportError:
-        raise UsageError("policy planner: needs scipy; pip install scipy") from None
-    return csgraph, csr_matrix
-
-
 @cache
 def _kernels() -> Any:
     """Return the compiled functions, ready to run; imported late, as numba takes a second."""
@@ -447,7 +400,6 @@ class PlannerPolicy:
     def __init__(self, settings: PlannerSettings | None = None) -> None:
         self._settings = settings or PlannerSettings()
         # No decision in flight waits for an import or a compilation.
-        _search()
         _kernels()
         self._map: OccupancyMap | None = None
         self._heights_m = np.zeros(LAYERS)
@@ -495,7 +447,8 @@ class PlannerPolicy:
         angle = yaw + (np.arange(bearings) + 0.5) * (fov / bearings) - 0.5 * fov
         ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         seen = np.isfinite(ranges)
-        points = position + ranges[..., None] * ray
+        points = position + np.where(seen, ranges, 0.0)[..., None] * ray
+        points[~seen] = np.inf
         elapsed_s = self._elapsed(state.time_us, s.period_s if told is None else held_s)
         now = self._map.level
         self._tracks, moving = follow(self._tracks, self._map, points[now], ranges[now], elapsed_s)
@@ -581,7 +534,7 @@ class PlannerPolicy:
         path, cost = known.path(position, goal, gap_in(level), s)
         if cost > DETOUR * float(np.hypot(*(goal - position))) + DETOUR_M:
             reached = [now, *reach(1), *reach(-1)]
-            widest = np.max([gap_in(layer) for layer in range(LAYERS)], axis=0)
+            widest = reduce(np.maximum, map(gap_in, range(LAYERS)))
             over, less = known.path(position, goal, widest, s)
             if less < SHORTER * cost:
                 rows, columns = known.cells_of(over)
@@ -594,8 +547,10 @@ class PlannerPolicy:
                 lost = np.where(clear, 1.0 - np.clip(room, 0.0, 1.0), 2.0)[:, furthest]
                 level = reached[int((lost.sum(axis=1) + 0.3 * off).argmin())]
                 path = over
-        return self._target(known, position, path, gap_in(level)), level, np.stack(
-            [gap_in(now), gap_in(level)]
+        return (
+            self._target(known, position, path, gap_in(level)),
+            level,
+            np.stack([gap_in(now), gap_in(level)]),
         )
 
     def _target(self, known: OccupancyMap, position: Floats, path: Floats, gap: Floats) -> Floats:

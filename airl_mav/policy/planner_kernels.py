@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 
 import numpy as np
@@ -156,24 +157,79 @@ def predict(
 
 @kernel
 def fill_gaps(square: Floats, reach: int) -> None:
-    """Replace squares (n, n) by the least square plus squared distance in cells, up to `reach`."""
-    n = len(square)
+    """Replace zero and far (n, n) by the squared distance to the next zero in cells, up to `reach`.
+
+    Far is (reach + 1) squared.
+    """
+    n, far = len(square), (reach + 1.0) ** 2
+    for column in range(n):
+        for order in (1, -1):
+            away = reach + 1.0
+            for k in range(n):
+                row = k if order == 1 else n - 1 - k
+                away = 0.0 if square[row, column] == 0.0 else min(away + 1.0, reach + 1.0)
+                square[row, column] = min(square[row, column], away * away)
     before = np.empty(n)
-    for axis in range(2):
-        for i in range(n):
-            for j in range(n):
-                before[j] = square[j, i] if axis == 0 else square[i, j]
-            for j in range(n):
-                least = before[j]
-                for k in range(1, reach + 1):
-                    if j >= k:
-                        least = min(least, before[j - k] + k * k)
-                    if j + k < n:
-                        least = min(least, before[j + k] + k * k)
-                if axis == 0:
-                    square[j, i] = least
-                else:
-                    square[i, j] = least
+    for row in range(n):
+        before[:] = square[row]
+        if before.min() == far:
+            continue
+        for column in range(n):
+            least = before[column]
+            for k in range(1, reach + 1):
+                if column >= k:
+                    least = min(least, before[column - k] + k * k)
+                if column + k < n:
+                    least = min(least, before[column + k] + k * k)
+            square[row, column] = least
+
+
+MOVES = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
+"""Moves between nodes of a path, forwards or backwards: rows, columns."""
+
+
+@kernel
+def find_path(cost: Floats, start: int, end: int) -> tuple[NDArray[np.int64], float]:
+    """Return the nodes of the path of least cost, and the cost.
+
+    A* (Hart, Nilsson, Raphael, IEEE Trans. Systems Science and Cybernetics 4(2), 1968). `cost`
+    (rows, columns) is of a unit of length in a node, at least 1; nodes are numbered row by row.
+    """
+    n = len(cost)
+    least, before = np.full(n * n, math.inf), np.full(n * n, -1)
+    done = np.zeros(n * n, np.bool_)
+    least[start] = 0.0
+    waiting = [(0.0, start)]
+    while waiting:
+        node = heapq.heappop(waiting)[1]
+        if node == end:
+            break
+        if done[node]:
+            continue
+        done[node] = True
+        row, column = node // n, node % n
+        for down, right in MOVES:
+            length = math.sqrt(down * down + right * right)
+            for sign in (1, -1):
+                r, c = row + sign * down, column + sign * right
+                if not (0 <= r < n and 0 <= c < n) or done[r * n + c]:
+                    continue
+                passed = 0.5 * (cost[row, column] + cost[r, c])
+                if abs(down) + abs(right) == 3:
+                    # A knight's move passes between two nodes, which count, too.
+                    half_r, half_c = sign * (down // 2), sign * int(right / 2)
+                    over = cost[row + half_r, column + half_c]
+                    over += cost[r - half_r, c - half_c]
+                    passed = 0.5 * (passed + 0.5 * over)
+                total = least[node] + length * passed
+                if total < least[r * n + c]:
+                    least[r * n + c], before[r * n + c] = total, node
+                    ahead = math.sqrt((r - end // n) ** 2 + (c - end % n) ** 2)
+                    heapq.heappush(waiting, (total + ahead, r * n + c))
+    nodes = [end]
+    while nodes[-1] != start:
+        nodes.append(before[nodes[-1]])
+    return np.array(nodes[::-1]), least[end]
 
 
 @kernel
@@ -211,9 +267,7 @@ def see_free(
 
 
 @kernel
-def scan_layers(
-    points: Floats, above: Floats, band: float, fov: float, ranges: Floats
-) -> None:
+def scan_layers(points: Floats, above: Floats, band: float, fov: float, ranges: Floats) -> None:
     """Reduce ranges (l, b) [m] to the nearest points of each layer and bearing.
 
     `points` (n, 3) are forward, right and down [m]; `above` (l,) are the heights of the layers
@@ -222,7 +276,7 @@ def scan_layers(
     layers, bearings = ranges.shape
     for k in range(len(points)):
         angle = math.atan2(points[k, 1], points[k, 0]) + 0.5 * fov
-        bearing = int(math.floor(angle * (bearings / fov)))
+        bearing = math.floor(angle * (bearings / fov))
         if not 0 <= bearing < bearings:
             continue
         away = math.hypot(points[k, 0], points[k, 1])
@@ -236,6 +290,7 @@ def warm_up() -> None:
     square, pair, none = np.zeros((4, 4)), np.zeros(2), np.zeros((0, 5))
     fill_gaps(square, 1)
     one = np.ones((1, 1))
+    find_path(one, 0, 0)
     see_free(square[None], pair, 1.0, pair, 0.0, 1.0, one, np.ones(1), 0.0)
     scan_layers(np.zeros((1, 3)), np.zeros(1), 1.0, 1.0, one)
     still, tables = np.zeros((1, 2)), (square[None], square, pair, 1.0, none, none)

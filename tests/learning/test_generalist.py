@@ -47,6 +47,11 @@ def test_it_reaches_goals_in_a_corridor() -> None:
     assert verdicts == [FlightStatus.SUCCESS] * 6
 
 
+def test_it_flies_through_gates_of_different_heights() -> None:
+    verdicts = [each.verdict for each in flown(spec("gates"), 6).values()]
+    assert verdicts == [FlightStatus.SUCCESS] * 6
+
+
 @pytest.mark.parametrize("compensate", [False, True])
 def test_it_flies_late(compensate: bool) -> None:
     late = spec("static-obstacles", compensate=compensate, delay={"latency": ("396ms",)})

@@ -91,13 +91,15 @@ def test_with_fixed_yaw_it_flies_the_same_way_and_never_turns(
     assert discrete_actions(spec("velocity-fixed-yaw")) is None
 
 
-@given(st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2)))
-def test_with_a_yaw_rate_it_flies_the_same_way_and_turns_as_asked(
-    action: tuple[float, float, float],
+@given(st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2)))
+def test_with_a_yaw_rate_it_flies_the_same_way_and_turns_and_climbs_as_asked(
+    action: tuple[float, float, float, float],
 ) -> None:
     turning = commands(spec("velocity3d-yaw-rate"), np.array([action]))
     np.testing.assert_array_equal(turning[:, :2], fly(action[:2])[:, :2])
-    assert turning[0, 2] == pytest.approx(math.radians(120.0) * min(1.0, max(-1.0, action[2])))
+    turn, down = np.clip(action[2:], -1.0, 1.0)
+    assert turning[0, 2] == pytest.approx(math.radians(120.0) * turn)
+    assert turning[0, 3] == pytest.approx(1.5 * down)
 
 
 def fly(*actions: tuple[float, float], speed: float = 5.0) -> np.ndarray:
