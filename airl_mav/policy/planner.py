@@ -2,10 +2,10 @@
 
 Level scans of each image, one for each height, update an occupancy grid (Elfes, IEEE Computer
 22(6), 1989), and tracks of moving obstacles. A* finds the path to the goal; unknown cells count as
-free. The policy holds its first height unless the path is blocked or long there: it then takes a path
-that is free at some height everywhere, and the height that is free the furthest. It pursues the
-most distant point of the path in line of sight. It predicts a set of velocities, each with a brake
-to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard, Thrun, IEEE
+free. The policy holds its first height unless the path is blocked or long there: it then takes a
+path that is free at some height everywhere, and the height that is free the furthest. It pursues
+the most distant point of the path in line of sight. It predicts a set of velocities, each with a
+brake to a stop, and takes the one with the least cost (a dynamic window: Fox, Burgard, Thrun, IEEE
 Robotics & Automation Magazine 4(1), 1997).
 """
 
