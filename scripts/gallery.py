@@ -173,8 +173,7 @@ def draw_flight(scenario: Scenario, path: Path) -> None:
     run = load(rehearse(scenario).path)
     episode = run.episodes[0]
     trajectory = run.trajectories[episode.index]
-    speed = float(trajectory.speed().max())
-    path.write_bytes(run_figures.map_figure(episode, trajectory, arena_of(run, episode), speed).png)
+    path.write_bytes(run_figures.map_figure(episode, trajectory, arena_of(run, episode)).png)
     shrink(path)
 
 

@@ -11,7 +11,6 @@ The `__init__` of an add-on is light and may define tables, which the core reads
     VIEW: {part of the live view: its class or function} (`rehearsal.live_view`)
     RECORDINGS: {suffix of a flight's recording: function that makes a run folder of it}
     FORENSICS: {`examine` or `section`: function for the causes of a run's failed flights}
-    NOTEBOOK: {`run` or `comparison`: function that returns its HTML}
     LIGHT: the commands can be imported without the simulator
     ENVIRONMENTS: {id of a Gymnasium environment: class}
     LOCKSTEP: {"firmware" or "companion": function that flies one side of two processes}

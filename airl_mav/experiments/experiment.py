@@ -14,7 +14,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from airl_mav.core import addons
 from airl_mav.core.child_process import stop_on_signals
 from airl_mav.core.clock import utc_now
 from airl_mav.core.files import Arrays, subfolder
@@ -106,14 +105,6 @@ class ExperimentResult:
     comparison: Comparison
     """Statistics of every run, and paired differences between runs."""
     page: Path
-
-    def _repr_html_(self) -> str | None:
-        """Return the notebook view: results, statistics and the first figure."""
-        html = addons.entries("airl_mav", "NOTEBOOK").get("comparison")
-        if html is None:
-            return None
-        loaded = {name: run_folder.load(run.path) for name, run in self.runs.items()}
-        return str(addons.load(html)(self.comparison, loaded, self.path, self.page))
 
 
 def file_name(text: str) -> str:
@@ -308,11 +299,6 @@ class Run:
             name: `episodes`, `decisions`, `latency` or `trajectories`.
         """
         return run_columns.TABLES[name](self._loaded)
-
-    def _repr_html_(self) -> str | None:
-        """Return the notebook view: the verdict, the statistics and a map of the flights."""
-        html = addons.entries("airl_mav", "NOTEBOOK").get("run")
-        return None if html is None else str(addons.load(html)(self._loaded))
 
     def report(self) -> Path:
         """Write the page and pictures of the run and return the page, or raise UsageError."""

@@ -85,6 +85,9 @@ LAYERS, BASE = 7, 3
 LAYER_M = 0.5
 """Distance of layers [m]."""
 
+ABOVE_M: Floats = np.float64(LAYER_M) * np.arange(-BASE, LAYERS - BASE)
+"""Heights of the layers above the first [m]."""
+
 LOWEST_M = 0.9
 """Minimum height of a layer above the start [m]."""
 
@@ -438,7 +441,7 @@ class PlannerPolicy:
         height_m = -float(state.position[2])
         if self._map is None:
             self._map = OccupancyMap(position, goal)
-            self._heights_m = height_m + LAYER_M * (np.arange(LAYERS) - BASE)
+            self._heights_m = height_m + ABOVE_M
         above = self._heights_m - height_m
         self._map.level = int(np.abs(above).argmin())
         # A bearing is wider than any column, so that a wall leaves none empty.

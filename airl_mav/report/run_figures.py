@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PathCollection
-from matplotlib.colorbar import Colorbar
-from matplotlib.colors import Colormap, ListedColormap, Normalize
-from matplotlib.figure import Figure
+from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -32,10 +29,6 @@ from airl_mav.report import document, theme
 
 LONG_TAIL = 30.0
 """Ratio of maximum to median above which the axis is logarithmic."""
-PATH_SEGMENTS = 500
-"""Maximum number of points of a drawn path; more add size without visible benefit."""
-PATH_COLOURS = 24
-"""Number of colour steps of a path; adjacent segments of one step form one line."""
 
 OUTCOME_COLOURS = {
     Outcome.SUCCESS: "#1b8a3f",
@@ -119,97 +112,15 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
 
 
 def map_figure(
-    episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
+    episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None
 ) -> theme.FigureImage:
     """Draw a map of a flight over its arena, if known, in its state at the flight's end."""
-    tall = 1.0
-    if arena is not None:
-        b = arena.bounds
-        tall = (b.north_max - b.north_min) / (b.east_max - b.east_min)
-    # The map is 4.15 inches wide; axis labels and legend need about one inch of height.
-    figure = theme.new_figure(5.2, 1.0 + 4.15 * min(max(tall, 0.5), 1.6))
-    ax = figure.add_subplot()
-    if arena is not None:
-        ended_us = episode.ended_us - episode.started_us
-        draw_arena(arena, ax, ended_us, goal_radius_m=episode.goal_radius_m)
-    else:
-        _draw_goal(ax, episode)
-    if trajectory is not None and len(trajectory) > 1:
-        _draw_path(figure, ax, episode, trajectory, top_speed)
-    theme.plain_axes(ax, grid=False)
-    theme.label_axes(ax, "east [m]", "north [m]")
-    theme.legend_below(figure, 3, handletextpad=0.4, columnspacing=1.2)
+    paths = {} if trajectory is None else {episode.index: trajectory}
+    panel = RunFlights("", "", [episode], paths, arena)
     label = document.OUTCOME_LABELS[episode.outcome]
-    alt = f"Flight {episode.index} from above, coloured by speed: {label}, {episode.reason}"
-    return theme.render(figure, f"flight-{episode.index:03d}-map", alt)
-
-
-def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
-    north, east = episode.goal[:2]
-    colour = OUTCOME_COLOURS[Outcome.SUCCESS]
-    ax.add_patch(
-        Circle((east, north), episode.goal_radius_m, facecolor="none", edgecolor=colour, lw=1.0)
-    )
-    ax.plot(east, north, marker="*", ms=15, color=colour, ls="none", label="goal")
-    ax.plot(
-        0.0, 0.0, marker="^", ms=11, color=theme.SERIES, ls="none", label="start, heading north"
-    )
-    ax.set_aspect("equal", adjustable="datalim")
-
-
-def _draw_path(
-    figure: Figure, ax: Axes, episode: EpisodeRecord, trajectory: Trajectory, top_speed: float
-) -> None:
-    keep = np.unique(
-        np.linspace(0, len(trajectory) - 1, min(len(trajectory), PATH_SEGMENTS)).astype(int)
-    )
-    points = trajectory.position[keep][:, [1, 0]]
-    speed = trajectory.speed()[keep]
-    colours = speed_colours()
-    scale = Normalize(0.0, top_speed)
-    ax.plot(*points.T, color=theme.HALO, lw=4.2, zorder=2.5, solid_capstyle="round")
-    pieces, levels = coloured_pieces(points, 0.5 * (speed[1:] + speed[:-1]), top_speed)
-    path = LineCollection(
-        pieces, cmap=colours, norm=scale, linewidths=2.2, capstyle="round", zorder=2.6
-    )
-    path.set_array(levels)
-    ax.add_collection(path)
-    outcome = episode.outcome
-    ax.plot(
-        *points[-1],
-        marker=OUTCOME_MARKERS[outcome],
-        ms=9 if outcome is not Outcome.SUCCESS else 7,
-        color=OUTCOME_COLOURS[outcome],
-        mec="white",
-        mew=1.0,
-        ls="none",
-        zorder=4,
-        label=f"end: {document.OUTCOME_LABELS[outcome]}",
-    )
-    bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, shrink=0.45, aspect=26, pad=0.015)
-    speed_bar(bar)
-
-
-def speed_bar(bar: Colorbar) -> None:
-    """Style the colour scale of a path."""
-    if bar.solids is not None:
-        # 256 colour steps are smaller as pixels than as shapes.
-        bar.solids.set_rasterized(True)
-    bar.outline.set_visible(False)
-    bar.set_label("speed [m/s]", fontsize=8.5, color=theme.MUTED)
-    bar.ax.tick_params(colors=theme.MUTED, labelsize=8, length=0)
-
-
-def coloured_pieces(
-    points: NDArray[np.float64], values: NDArray[np.float64], top: float
-) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-    """Split a line (n, 2) at colour changes, by its segments' values (n - 1,)."""
-    step = top / PATH_COLOURS
-    levels = np.clip((values / step).astype(int), 0, PATH_COLOURS - 1)
-    cuts = np.flatnonzero(np.diff(levels)) + 1
-    starts, ends = [0, *cuts], [*cuts, len(values)]
-    pieces = [points[start : end + 1] for start, end in zip(starts, ends, strict=True)]
-    return pieces, (levels[np.array(starts)] + 0.5) * step
+    alt = f"Flight {episode.index} from above: {label}, {episode.reason}"
+    name = f"flight-{episode.index:03d}-map"
+    return _draw_panel(name, alt, panel, _extent([panel]), width_in=5.2)
 
 
 PATH_POINTS = 120
@@ -218,7 +129,7 @@ PATH_POINTS = 120
 OPAQUE_FLIGHTS = 25
 """Maximum number of paths drawn at full opacity; with more paths, opacity decreases."""
 
-MARGIN_M = 0.5
+MARGIN_M = 1.0
 """Margin around walls and paths [m]."""
 
 
@@ -299,7 +210,10 @@ def _draw_panel(
     ax: Axes = figure.subplots()
     seeds = {flight.arena_seed for flight in panel.episodes}
     if panel.arena is not None and seeds == {panel.arena.seed}:
-        draw_arena(panel.arena, ax, goal_radius_m=panel.episodes[0].goal_radius_m)
+        first, *others = panel.episodes
+        # Moving obstacles of several flights are drawn at their start.
+        ended_us = 0 if others else first.ended_us - first.started_us
+        draw_arena(panel.arena, ax, ended_us, goal_radius_m=first.goal_radius_m)
     else:
         _draw_ground(ax, None if panel.arena is None else panel.arena.bounds)
         goals = np.array([(flight.goal[1], flight.goal[0]) for flight in panel.episodes])

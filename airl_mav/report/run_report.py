@@ -269,14 +269,13 @@ def by_flight_section(page: ReportInput) -> tuple[Section, ...]:
 
 def flights_section(page: ReportInput) -> tuple[Section, ...]:
     """Return the table of flights, and still pictures of the worst."""
-    top = plotly_scene.top_speed([flight.scene for flight in page.view])
     causes = {each.record.index: each.cause for each in page.worst}
     drawn: list[tuple[EpisodeRecord, Cause | None, list[FigureImage]]] = []
     for record in pictured(page.run):
         number = page.numbers.get(record.index)
         flight = None if number is None else page.view[number]
         path = None if flight is None else flight.scene.path
-        pictures = [map_figure(record, path, page.arenas.get(record.index), top)]
+        pictures = [map_figure(record, path, page.arenas.get(record.index))]
         drawn.append((record, causes.get(record.index), pictures))
     return tables_section(
         run_tables.episodes_table(page.run, run_tables.MAX_FLIGHTS),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import base64
 import json
 import re
 from pathlib import Path
@@ -11,9 +10,6 @@ from typing import Any
 
 import pytest
 
-from airl_mav import Scenario, load_run, rehearse
-from airl_mav.addons.notebook.notebook import run_html
-from airl_mav.rehearsal.run_folder import load
 from tests.support.processes import ROOT
 
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
@@ -38,7 +34,7 @@ def test_the_cells_of_a_notebook_run_one_after_the_other(
         exec(compile(program, path.name, "exec"), known)  # noqa: S102 (this project's own)
         if isinstance(last, ast.Expr):
             value = eval(compile(ast.Expression(last.value), path.name, "eval"), known)  # noqa: S307 (as above)
-            shown += [value._repr_html_()] if hasattr(value, "_repr_html_") else []
+            shown += [] if value is None else [repr(value)]
     check(shown, capsys.readouterr().out)
 
 
@@ -60,10 +56,10 @@ def test_a_notebook_runs_as_it_stands(
     resources = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=240, resources=resources).execute()
     shown = [
-        output.data["text/html"]
+        output.data["text/plain"]
         for cell in code
         for output in cell.outputs
-        if output.output_type == "execute_result" and "text/html" in output.data
+        if output.output_type == "execute_result"
     ]
     printed = "".join(
         output.text for cell in code for output in cell.get("outputs", ()) if "text" in output
@@ -73,45 +69,6 @@ def test_a_notebook_runs_as_it_stands(
 
 def check(shown: list[str], printed: str) -> None:
     assert len(shown) == 3
-    for html in shown:
-        check_picture(html)
-    runs, curve = shown[:2], shown[2]
-    assert all("of 12 goals reached" in html for html in runs)
-    assert "flight time" in curve
-    assert "400ms" in curve
+    assert all("upper" in text for text in shown), "with intervals"
+    assert "400ms" in shown[2]
     assert re.search(r"t2: 39\d ms", printed), "the paper's Raspberry Pi: 396 ms"
-
-
-def check_picture(html: str) -> None:
-    (picture,) = re.findall(r'<img src="data:image/png;base64,([^"]+)" alt="[^"]+', html)
-    assert base64.b64decode(picture).startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("episodes", [1, 4])
-def test_a_run_shows_itself(episodes: int, tmp_path: Path) -> None:
-    asked: dict[str, Any] = {"policy": "greedy", "arena": "no-obstacles", "level": "gym"}
-    run = rehearse(Scenario(episodes=episodes, seed=20, **asked), out=tmp_path / "run")
-    before = sorted(tmp_path.rglob("*"))
-    html = run._repr_html_() or ""
-    assert sorted(tmp_path.rglob("*")) == before, "to show it writes nothing"
-    check_picture(html)
-    rate = run.quality.success_rate
-    assert rate.value is not None
-    assert f"{round(rate.value * episodes)} of {episodes} goals reached" in html
-    assert run.quality.flight_time_s.value is not None
-    assert f"{run.quality.flight_time_s.value:.1f} s" in html
-    assert str(run.path) in html
-
-
-def test_a_run_without_flights_or_profiles_shows_itself(tmp_path: Path) -> None:
-    asked: dict[str, Any] = {"policy": "greedy", "level": "gym", "episodes": 1}
-    arena = tmp_path / "mine.toml"
-    shipped = ROOT / "profiles" / "arenas" / "no-obstacles.toml"
-    arena.write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
-    run = rehearse(Scenario(arena=str(arena), **asked), out=tmp_path / "run")
-    arena.unlink()
-    check_picture(load_run(run.path)._repr_html_() or "")
-    (tmp_path / "run" / "episodes.jsonl").write_bytes(b"")
-    html = run_html(load(run.path))
-    assert "no flight was finished" in html
-    assert "<img" not in html

@@ -27,7 +27,6 @@ from airl_mav.report.plotly_scene import (
     plotly_script,
     scene_json,
 )
-from airl_mav.report.run_figures import coloured_pieces
 from tests.support.run_demo import demo_arena, write_demo_run
 
 Demo = tuple[LoadedRun, dict[int, Arena]]
@@ -211,15 +210,6 @@ def test_the_slider_moves_obstacles_along_their_tours(demo: Demo) -> None:
             assert np.allclose(np.array(mesh["x"])[here] + shift[0], corners[:, 0], atol=0.05)
             assert np.allclose(np.array(mesh["y"])[here] + shift[1], corners[:, 1], atol=0.05)
         first += count
-
-
-def test_a_path_is_cut_where_its_colour_changes() -> None:
-    points = np.stack([np.arange(11.0), np.zeros(11)], axis=1)
-    values = np.array([0.1] * 4 + [4.0] * 5 + [0.1])
-    pieces, levels = coloured_pieces(points, values, 5.0)
-    assert [len(piece) for piece in pieces] == [5, 6, 2]
-    assert pieces[0][-1].tolist() == pieces[1][0].tolist()
-    assert np.abs(levels - [0.1, 4.0, 0.1]).max() < 5.0 / 24.0
 
 
 def test_a_flight_without_an_arena(demo: Demo) -> None:

@@ -26,11 +26,11 @@ from airl_mav.policy import planner_kernels as kernels
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import InFlight
 from airl_mav.policy.planner import (
+    ABOVE_M,
     BASE,
     BLOCKED,
     CELLS,
     CREEP_M_S,
-    LAYER_M,
     LAYERS,
     LEARNED,
     OUTCOME_FEATURES,
@@ -67,8 +67,7 @@ def update(known: OccupancyMap, position: Floats, ranges: Floats, hits: Floats) 
     """Look at the layer of the vehicle alone."""
     every, all_hits = np.zeros((LAYERS, BEARINGS)), [NO_HITS] * LAYERS
     every[BASE], all_hits[BASE] = ranges, hits
-    above = LAYER_M * (np.arange(LAYERS) - BASE)
-    known.look(position, 0.0, FOV, every, above, np.zeros(LAYERS), all_hits)
+    known.look(position, 0.0, FOV, every, ABOVE_M, np.zeros(LAYERS), all_hits)
 
 
 def seen_from(position: Floats, circles: list[tuple[Floats, float]]) -> tuple[Floats, Floats]:
@@ -157,11 +156,11 @@ def test_a_scan_keeps_the_nearest_range_of_each_height_and_bearing(
 
 
 def test_a_layer_is_free_behind_what_is_seen_past() -> None:
-    known, above = new_map(), LAYER_M * (np.arange(LAYERS) - BASE)
+    known = new_map()
     ranges = np.full((LAYERS, BEARINGS), np.inf)
     # A beam 4 m ahead, half a metre above the vehicle.
     ranges[BASE + 1] = 4.0
-    known.look(np.zeros(2), 0.0, FOV, ranges, above, np.zeros(LAYERS), [NO_HITS] * LAYERS)
+    known.look(np.zeros(2), 0.0, FOV, ranges, ABOVE_M, np.zeros(LAYERS), [NO_HITS] * LAYERS)
     rows, columns = known.cells_of(np.array([[3.0, 0.0], [5.0, 0.0], [12.0, 0.0]]))
     near, behind, far = (known.evidence[:, rows, columns] < 0.0).T.tolist()
     assert near == [True] * LAYERS
