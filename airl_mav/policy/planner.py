@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import near_points
 from airl_mav.policy.observation import Observation
@@ -315,21 +314,17 @@ STRAIGHT_ON_S = np.array([0.0, 0.6, 1.5])
 
 
 def _search() -> tuple[Any, Any]:
-    """Return scipy's `csgraph` and `csr_matrix`. Raises UsageError without scipy."""
-    try:
-        from scipy.sparse import csgraph, csr_matrix
-    except ImportError:
-        raise UsageError("policy planner: needs scipy; pip install scipy") from None
+    """Return scipy's `csgraph` and `csr_matrix`; imported late, as few policies need them."""
+    from scipy.sparse import csgraph, csr_matrix
+
     return csgraph, csr_matrix
 
 
 @cache
 def _kernels() -> Any:
     """Return the compiled functions, ready to run; imported late, as numba takes a second."""
-    try:
-        from airl_mav.policy import planner_kernels
-    except ImportError:
-        raise UsageError("policy planner: needs numba; pip install numba") from None
+    from airl_mav.policy import planner_kernels
+
     planner_kernels.warm_up()
     return planner_kernels
 
