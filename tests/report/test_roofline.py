@@ -128,7 +128,7 @@ def test_a_computer_that_was_never_timed_is_left_out_and_said_so(
     assert "left out: no workload template-5x32 measured (measured: none)" in shown[1]
     refusals: tuple[tuple[dict[str, Any], str], ...] = (
         ({"computers": (left.computer,)}, "no workload template-5x32 measured"),
-        ({"workload": "policy"}, "no latency measured for generalist "),
+        ({"workload": "policy"}, "no latency measured for static-obstacles-fast "),
         ({"workload": "estimate"}, "workload 'estimate': accepted: a measured workload, or policy"),
         ({"policy": "greedy", "sensing_distance_m": None}, "policy greedy is no network"),
         ({"computers": ("ras-pi-4", "ras-pi-4")}, "each once"),
