@@ -15,6 +15,6 @@ RUN pip install --no-cache-dir --no-deps --require-hashes --requirement /tmp/sim
 USER 1000
 WORKDIR /home/airl
 # Kernels compile while the image is built, so that a container flies within seconds.
-RUN airl-firmware --duration 1
+RUN airl sitl --level lockstep --episodes 1 --out /tmp/first && rm -r /tmp/first
 ENTRYPOINT ["airl"]
 CMD ["sitl", "--level", "lockstep", "--episodes", "3", "--out", "runs/container"]

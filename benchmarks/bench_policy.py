@@ -24,7 +24,6 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import open_model
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.registry import find_policy, load_learned
-from airl_mav.scenario.model import DEFAULT_POLICY
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.config import ALGORITHMS, AlgorithmSpec, TrainingConfig
 from airl_mav.training.export import network_of
@@ -48,7 +47,7 @@ def timed(call: Callable[[], object]) -> tuple[float, float]:
 
 
 def main() -> None:
-    policy = find_policy(sys.argv[1] if len(sys.argv) > 1 else DEFAULT_POLICY)
+    policy = find_policy(sys.argv[1] if len(sys.argv) > 1 else "static-obstacles-fast")
     card, folder = policy.card, policy.folder
     assert card is not None and folder is not None, "a learned policy"
     rng = np.random.default_rng(0)

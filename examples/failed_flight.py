@@ -5,7 +5,12 @@ from airl_mav.addons.forensics.worst import examine_worst
 from airl_mav.flight.judge import Outcome
 from airl_mav.rehearsal.run_folder import arenas_of, load, vehicle_of
 
-slow = Scenario(latency="lognormal:396ms,20ms", level="gym", episodes=40)
+slow = Scenario(
+    policy="static-obstacles-fast",
+    latency="lognormal:396ms,20ms",
+    level="gym",
+    episodes=40,
+)
 run = load(rehearse(slow, out="runs/pi").path)
 
 vehicle = vehicle_of(run.info)

@@ -2,7 +2,8 @@
 
 from airl_mav import Scenario, latency_sweep
 
-curve = latency_sweep(Scenario(level="gym", episodes=50), latencies=("native", "200ms", "400ms"))
+asked = Scenario(policy="static-obstacles-fast", level="gym", episodes=50)
+curve = latency_sweep(asked, latencies=("native", "200ms", "400ms"))
 
 print("latency   success   flight time   distance")
 for run in curve.comparison.runs:

@@ -38,11 +38,10 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.px4_release import CURRENT, PX4ReleaseName, stored_release, version_name
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, RealFirmware
-from airl_mav.scenario.model import DEFAULT_POLICY
 from firmware_sim.external.programs import check_free, firmware_kind
 
 ROOT = Path(__file__).resolve().parents[1]
-POLICIES = (DEFAULT_POLICY, "body-rates")
+POLICIES = ("static-obstacles-fast", "body-rates")
 ATTEMPTS = 3
 """Maximum number of instances that are tried."""
 READY_S = 240.0

@@ -16,7 +16,7 @@ from airl_mav.profiles import computer, loading
 
 SAYS = (
     "measured: samples of that machine, replayed in their order. published: mean and spread that"
-    " its source gives. Any other policy is estimated by its multiply-accumulates: --workload"
+    " its source gives. Any other network is estimated by its multiply-accumulates: --workload"
     " estimate."
 )
 

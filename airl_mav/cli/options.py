@@ -326,7 +326,7 @@ EXTRAS = {
     "profile": ("onnx",),
     "data": ("minari", "pandas", "pyarrow"),
     "identify": ("mcap", "pyulog"),
-    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "PIL", "pymavlink", "scipy"),
+    "sim": ("filterpy", "jinja2", "matplotlib", "PIL", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
     "view": ("viser",),
 }

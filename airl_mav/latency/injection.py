@@ -191,7 +191,10 @@ def choose_injection(
 def _estimate(computer: ComputerProfile, macs: int | None) -> Injection:
     """Scale the workload nearest in multiply-accumulates to `macs`."""
     if not macs or macs < 1:
-        raise UsageError("workload = 'estimate': the policy's card gives no multiply-accumulates")
+        raise UsageError(
+            "workload = 'estimate': accepted: a policy that is only a network; measure another one"
+            " with airl profile, or give --latency"
+        )
     if not computer.workloads:
         raise UsageError("workload = 'estimate': this computer has no workload to estimate from")
     name, work = min(

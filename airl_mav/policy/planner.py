@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import Action, fastest_climb
 from airl_mav.policy.greedy import level_points
 from airl_mav.policy.observation import Observation
@@ -336,10 +335,8 @@ STRAIGHT_ON_S = np.array([0.0, 0.6, 1.5])
 @cache
 def _kernels() -> Any:
     """Return the compiled functions, ready to run; imported late, as numba takes a second."""
-    try:
-        from airl_mav.policy import planner_kernels
-    except ImportError:
-        raise UsageError("policy planner: needs numba; pip install numba") from None
+    from airl_mav.policy import planner_kernels
+
     planner_kernels.warm_up()
     return planner_kernels
 

@@ -288,8 +288,10 @@ class PolicyInfo:
 
     @property
     def macs(self) -> int | None:
-        """Multiply-accumulates of one inference."""
-        return None if self.card is None else self.card.macs
+        """Multiply-accumulates of a decision; None = unknown, as if the layout plans."""
+        if self.card is None or layout_of(self.card.observation.layout).remembers:
+            return None
+        return self.card.macs
 
 
 def camera_refused(policy: PolicyInfo, vehicle: VehicleProfile) -> str | None:

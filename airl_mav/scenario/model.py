@@ -41,7 +41,7 @@ PolicyName = Annotated[
     "policy",
 ]
 
-DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles-fast", "static-obstacles"
+DEFAULT_POLICY, DEFAULT_ARENA = "generalist", "static-obstacles"
 """Default policy and arena of a scenario."""
 ONBOARD_COMPUTER, REFERENCE_COMPUTER = "ras-pi-4", "workstation"
 """Default computers of experiments that compare an onboard computer with a reference."""

@@ -69,6 +69,6 @@ def test_a_notebook_runs_as_it_stands(
 
 def check(shown: list[str], printed: str) -> None:
     assert len(shown) == 3
-    assert all("upper" in text for text in shown), "with intervals"
+    assert all("low=" in text for text in shown), "with intervals"
     assert "400ms" in shown[2]
     assert re.search(r"t2: 39\d ms", printed), "the paper's Raspberry Pi: 396 ms"

@@ -236,8 +236,10 @@ main.main()
 
 def in_light_install(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run `airl` where only the companion's installation is there."""
-    # A learned policy needs ONNX Runtime, which the light installation has.
-    block = BLOCK.replace("'onnxruntime', ", "")
+    # The default policy needs these, which the light installation has.
+    block = BLOCK
+    for name in ("airl_mav.core.kernels", "numba", "onnxruntime", "scipy"):
+        block = block.replace(f"'{name}', ", "")
     absent = "\nimport importlib.util as u\nfound = u.find_spec\n" + (
         "def find_spec(name, package=None):\n"
         "    try:\n"

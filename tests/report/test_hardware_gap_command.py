@@ -576,7 +576,7 @@ def test_a_named_computer_is_flown_whole_and_its_latency_alone(tmp_path: Path) -
 
 
 def test_the_latency_of_an_estimate_is_not_flown_alone() -> None:
-    roles, (remark,) = roles_of(workload="estimate")
+    roles, (remark,) = roles_of(policy="static-obstacles-fast", workload="estimate")
     assert ALONE not in roles
     assert "is an estimate: not flown alone" in remark
 

@@ -53,6 +53,7 @@ class Truth:
         """Scenario known to the companion, with the true wind and link."""
         north, east = self.wind
         return Scenario(
+            policy="static-obstacles-fast",
             level="lockstep",
             seed=self.seed,
             latency=f"lognormal:{self.t2_ms:g}ms,{0.1 * self.t2_ms:g}ms",

@@ -66,7 +66,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_good_camera_and_no_flight_controller(tmp_path: Path) -> None:
     policy, camera, vehicle = found_with(tmp_path, "Mine")
-    assert policy == ("policy", True, "static-obstacles-fast, holds an action 0.1 s")
+    assert policy == ("policy", True, "generalist, holds an action 0.1 s")
     assert camera.good
     assert camera.told.startswith("64x48 px, ")
     assert "every image is the same" not in camera.told

@@ -71,7 +71,7 @@ def test_an_estimate_scales_the_nearest_workload(macs: int, rate: float) -> None
 
 def test_nothing_to_estimate_from() -> None:
     pi = load_computer("ras-pi-4")
-    with pytest.raises(UsageError, match="multiply-accumulates"):
+    with pytest.raises(UsageError, match="measure another one with airl profile"):
         choose_injection(pi, ESTIMATE)
     bare = pi.model_copy(update={"workloads": {}})
     with pytest.raises(UsageError, match="no workload"):

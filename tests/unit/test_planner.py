@@ -18,10 +18,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage, signal
 
-from airl_mav import Scenario, policy, rehearse
-from airl_mav.core.errors import UsageError
+from airl_mav import Scenario, rehearse
 from airl_mav.flight.judge import Outcome
-from airl_mav.policy import planner
 from airl_mav.policy import planner_kernels as kernels
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import InFlight
@@ -246,14 +244,6 @@ def test_no_path_leads_through_a_wall_one_cell_thick() -> None:
     crossing = path[np.abs(path[:, 0] - 10.0) < 0.6]
     assert len(crossing) > 0
     assert (np.abs(crossing[:, 1] - 12.0) < 1.2).all()
-
-
-def test_without_numba_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    planner._kernels.cache_clear()
-    monkeypatch.delattr(policy, "planner_kernels", raising=False)
-    monkeypatch.setitem(sys.modules, "airl_mav.policy.planner_kernels", None)
-    with pytest.raises(UsageError, match="needs numba; pip install numba"):
-        PlannerPolicy()
 
 
 def test_it_loads_its_kernels_before_the_flight() -> None:

@@ -408,6 +408,9 @@ def test_what_was_measured_for_this_policy_is_injected(exported: Path, tmp_path:
     assert other.injection.origin == "measured"
     guess = resolve(Scenario(policy=path, computer="ras-pi-4", workload="estimate"))
     assert guess.injection.origin == "estimated"
+    # Its decision is much longer than its network.
+    with pytest.raises(UsageError, match="a policy that is only a network"):
+        resolve(Scenario(policy="generalist", computer="ras-pi-4", workload="estimate"))
 
     # Stand-alone, the companion runs on that very computer. In lockstep no computer counts.
     asked, policy = StandAloneCompanion(policy=path, computer=str(computer)), resolved.policy
