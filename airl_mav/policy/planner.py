@@ -116,6 +116,21 @@ DETOUR, DETOUR_M, SHORTER = 1.2, 2.0, 0.8
 tried; their path must cost at most `SHORTER` of it."""
 
 
+class Scans(NamedTuple):
+    """Level scans of an image in layers of different heights, over the field of view."""
+
+    above: Floats
+    """(l,) heights of the layers above the vehicle [m]."""
+    ranges: Floats
+    """(l, b) nearest range of each bearing [m]; infinite = no return."""
+    lowest: float
+    """Slope of the lowest line of sight."""
+    per_slope: float
+    """Lines of sight in a unit of the slope."""
+    rays: Floats
+    """(b, s) nearest range of each bearing and slope [m]."""
+
+
 class OccupancyMap:
     """Occupancy grid with memory, in layers of different heights."""
 
@@ -134,34 +149,16 @@ class OccupancyMap:
         return index[:, 0], index[:, 1]
 
     def look(
-        self,
-        position: Floats,
-        yaw: float,
-        fov: float,
-        ranges: Floats,
-        above: Floats,
-        nearest: Floats,
-        hits: Sequence[Floats],
+        self, position: Floats, yaw: float, fov: float, seen: Scans, hits: Sequence[Floats]
     ) -> None:
-        """Update the evidence by scans: ranges (l, b) [m] over the view, hits (n, 2) of each [m].
-
-        `above` (l,) are the heights of the layers above the vehicle [m], and `nearest` (l,) the
-        ranges [m] from which they are in view.
-        """
+        """Update the evidence by scans over the view, and the hits (n, 2) of each layer [m]."""
         # A cell is as wide as a bearing in some distance: its neighbours must be free, too.
-        padded = np.pad(np.minimum(ranges, FREE_M), ((0, 0), (1, 1)))
+        padded = np.pad(np.minimum(seen.ranges, FREE_M), ((0, 0), (1, 1)))
         limit = np.minimum(np.minimum(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
         limit -= 0.9 * self.cell
-        # A return in a layer between covers what is behind it on the same lines of sight.
-        away = np.abs(above)
-        for step in (1, -1):
-            for layer in range(self.level + 2 * step, LAYERS if step > 0 else -1, step):
-                for between in range(self.level + step, layer, step):
-                    share = away[layer] / (away[between] + 0.5 * LAYER_M)
-                    np.minimum(limit[layer], share * padded[between, 1:-1], out=limit[layer])
         place, per_rad = (self.origin, self.cell, position), limit.shape[1] / fov
-        seen = (limit, nearest, LEAST)
-        _kernels().see_free(self.evidence, *place, yaw - 0.5 * fov, per_rad, *seen)
+        view = (seen.above, self.level, seen.lowest, seen.per_slope, seen.rays)
+        _kernels().see_free(self.evidence, *place, yaw - 0.5 * fov, per_rad, limit, *view, LEAST)
         for evidence, each in zip(self.evidence, hits, strict=True):
             hit = self.cells_of(each)
             evidence[hit] = np.minimum(MOST, evidence[hit] + 1.0)
@@ -172,8 +169,11 @@ class OccupancyMap:
         A distance transform in two passes (Felzenszwalb, Huttenlocher, Theory of Computing 8).
         The newest `hits` (n, 2) are obstacles, even if their cells were free.
         """
-        reach = math.ceil(reach_m / self.cell)
-        square = np.where(self.evidence[layer] > 0.0, 0.0, (reach + 1.0) ** 2)
+        reach, known = math.ceil(reach_m / self.cell), self.evidence[layer]
+        if layer != BASE:
+            # Until it is seen, an obstacle is as high as the arena.
+            known = np.where(known == 0.0, reduce(np.maximum, self.evidence), known)
+        square = np.where(known > 0.0, 0.0, (reach + 1.0) ** 2)
         square[self.cells_of(hits)] = 0.0
         _kernels().fill_gaps(square, reach)
         return np.sqrt(square) * self.cell
@@ -322,6 +322,9 @@ ASIDE_M_S = 3.75
 BLIND_M = 1.0
 """Maximum distance flown during a decision [m]."""
 
+PATIENCE_S, MOVED_M = 2.0, 1.0
+"""Time without a move of `MOVED_M` [m] after which small static gaps cost less [s]."""
+
 DRIFT_M_S = 0.5
 """Growth of the minimum gap with the latency [m/s]."""
 
@@ -408,6 +411,8 @@ class PlannerPolicy:
         self._time_us: int | None = None
         self._last = np.zeros(2)
         """Previous setpoint, north, east [m/s]."""
+        self._waited_s, self._waits_at = 0.0, np.full(2, np.inf)
+        """Time near the same position [s], and that position, north, east [m]."""
         self._side = 1.0
         """Direction of a turn to the rear, 1 = right; kept to avoid oscillation."""
 
@@ -421,7 +426,7 @@ class PlannerPolicy:
     def candidates(self, observation: Observation, *, features: bool = False) -> Candidates:
         """Return the candidates for an observation; without `features` they have none."""
         s, state, yaw = self._settings, observation.states[0], float(observation.yaw)
-        lens, fov = observation.intrinsics, observation.intrinsics.horizontal_fov_rad
+        fov = observation.intrinsics.horizontal_fov_rad
         to_world = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         told = observation.in_flight
         latency_s = s.latency_s if told is None else float(told.latency_s)
@@ -441,8 +446,8 @@ class PlannerPolicy:
             self._heights_m = height_m + ABOVE_M
         above = self._heights_m - height_m
         self._map.level = int(np.abs(above).argmin())
-        # A bearing is wider than any column, so that a wall leaves none empty.
-        ranges = scan(level_points(observation), above, s.band_m, fov, int(fov * lens.focal / 1.1))
+        looked = scan(observation, above, s.band_m)
+        ranges = looked.ranges
         bearings = ranges.shape[1]
         angle = yaw + (np.arange(bearings) + 0.5) * (fov / bearings) - 0.5 * fov
         ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -451,15 +456,15 @@ class PlannerPolicy:
         points[~seen] = np.inf
         elapsed_s = self._elapsed(state.time_us, s.period_s if told is None else held_s)
         now = self._map.level
+        self._waited_s += elapsed_s
+        if float(np.hypot(*(position - self._waits_at))) > MOVED_M:
+            self._waited_s, self._waits_at = 0.0, position
         self._tracks, moving = follow(self._tracks, self._map, points[now], ranges[now], elapsed_s)
         # Higher and lower parts of what moves are no obstacles, either.
         beside = (ranges > ranges[now] - WIDEST_M) & (ranges < ranges[now] + WIDEST_M)
         still = seen & ~(moving & beside)
         hits = [each[rows] for each, rows in zip(points, still, strict=True)]
-        upright, half = float(observation.pitch), math.atan2(0.5 * lens.height, lens.focal)
-        nearest = nearest_in_view(above, upright + half, upright - half)
-        nearest[now] = 0.0
-        self._map.look(position, yaw, fov, ranges, above, nearest, hits)
+        self._map.look(position, yaw, fov, looked, hits)
         target, level, gaps = self._way(self._map, position, goal, hits)
         velocity = to_world @ observation.velocity[:2]
         bearing = math.atan2(target[1] - position[1], target[0] - position[0])
@@ -557,8 +562,11 @@ class PlannerPolicy:
         """Return the pursued point: the most distant one of the path in line of sight."""
         s = self._settings
         room_m = s.radius_m + s.margin_m + 0.1
-        # Never the point next to the vehicle: it would stop there.
-        best, *further = path[min(3, len(path) - 1) :]
+        # Never the point next to the vehicle, where it would stop, but to go round a corner.
+        near, further = path[1:4][::-1], path[4:]
+        tight_m = s.radius_m + 0.5 * s.margin_m
+        passable = [each for each in near if known.is_clear(gap, position, each, tight_m)]
+        best = passable[0] if passable else path[min(3, len(path) - 1)]
         for point in further[:: max(1, len(path) // 40)]:
             if float(np.hypot(*(point - position))) > SIGHT_M:
                 break
@@ -597,7 +605,10 @@ class PlannerPolicy:
         found = np.empty((8, len(STRAIGHT_ON_S), len(wishes)))
         # The longer the reaction, the less certain is the position.
         margin_m = s.margin_m + DRIFT_M_S * (hold.held_s - s.period_s)
-        body = (s.radius_m, margin_m, s.response_s, s.brake_m_s2, s.speeds_m_s[-1])
+        # A vehicle that does not get on passes closer.
+        patience = min(1.0, max(0.0, 2.0 - self._waited_s / PATIENCE_S))
+        dynamics = (s.response_s, s.brake_m_s2, s.speeds_m_s[-1])
+        body = (s.radius_m, margin_m, *dynamics, patience)
         _kernels().predict(
             *(gaps, known.evidence[level], known.origin, known.cell),
             *(_rows(track for track in self._tracks if getattr(track, kind)) for kind in KINDS),
@@ -658,20 +669,24 @@ def _rows(tracks: Iterable[Track]) -> Floats:
     return np.array(rows, np.float64).reshape(-1, 5)
 
 
-def scan(points: Floats, above: Floats, band_m: float, fov: float, bearings: int) -> Floats:
-    """Return the nearest ranges (l, bearings) [m] in layers at heights `above` (l,) the vehicle.
+STEEPEST = 3.0
+"""Maximum slope of a line of sight in a scan."""
 
-    Points are (n, 3), forward, right, down [m]; those within `band_m` of a layer's height count.
+
+def scan(observation: Observation, above: Floats, band_m: float) -> Scans:
+    """Return the scans of an image in layers at heights `above` (l,) the vehicle [m].
+
+    Returns within `band_m` of a layer's height count to it.
     """
-    ranges = np.full((len(above), bearings), np.inf)
-    _kernels().scan_layers(points, above, band_m, fov, ranges)
-    return ranges
-
-
-def nearest_in_view(above: Floats, upper: float, lower: float) -> Floats:
-    """Return the ranges (l,) [m] from which heights above the vehicle are in view.
-
-    `upper` and `lower` are the elevations of the view's edges [rad].
-    """
-    edge = np.where(above > 0.0, math.tan(max(upper, 1e-3)), math.tan(min(lower, -1e-3)))
-    return np.asarray(above / edge)
+    lens, fov = observation.intrinsics, observation.intrinsics.horizontal_fov_rad
+    # A bearing is wider than any column, so that a wall leaves none empty.
+    bearings = int(fov * lens.focal / 1.1)
+    half = math.atan2(0.5 * lens.height, lens.focal) - abs(math.sin(0.5 * fov) * observation.roll)
+    edges = np.array([observation.pitch - half, observation.pitch + half])
+    lowest, highest = np.clip(np.tan(np.clip(edges, -1.5, 1.5)), -STEEPEST, STEEPEST).tolist()
+    slopes = max(1, int((highest - lowest) * lens.focal / 1.1))
+    per_slope = slopes / max(highest - lowest, 1e-3)
+    ranges, rays = np.full((len(above), bearings), np.inf), np.full((bearings, slopes), np.inf)
+    points = level_points(observation)
+    _kernels().scan_layers(points, above, band_m, fov, lowest, per_slope, ranges, rays)
+    return Scans(above, ranges, lowest, per_slope, rays)

@@ -97,8 +97,8 @@ def predict(
         last: (2,) previous velocity.
         hold: Lead and hold [s], yaw rate and previous yaw rate [rad/s], time until the height is
             reached [s], dead time [s].
-        body: Radius, margin [m], time constant of the velocity [s], acceleration [m/s2], speed to
-            the target [m/s].
+        body: Radius, margin [m], time constant of the velocity [s],
+            acceleration [m/s2], speed to the target [m/s], weight of small static gaps.
         found: (8, k, c) outcomes, written.
     """
     radius, margin, response_s, most_m_s2, speed = body[0], body[1], body[2], body[3], body[4]
@@ -145,7 +145,7 @@ def predict(
                     cost, hit_s = 1000.0 - 100.0 * t - 30.0 * max(depth, -3.0), t
                     there = True
                     continue
-                charge = 2.0 * max(0.0, NEAR_M - moving) + max(0.0, CLOSE_M - static)
+                charge = 2.0 * max(0.0, NEAR_M - moving) + body[5] * max(0.0, CLOSE_M - static)
                 cost += STEP_S * (1.0 + charge)
                 there = math.hypot(x - places[2, 0], y - places[2, 1]) < ARRIVED_M
             left = math.hypot(x - places[3, 0], y - places[3, 1]) / speed
@@ -241,13 +241,18 @@ def see_free(
     first: float,
     per_rad: float,
     limit: Floats,
-    nearest: Floats,
+    above: Floats,
+    level: int,
+    slope: float,
+    per_slope: float,
+    rays: Floats,
     lowest: float,
 ) -> None:
     """Lower the evidence (l, rows, columns) of cells in front of the returns.
 
-    `limit` (l, b) are the free ranges of bearings from `first` [rad] on, `per_rad` in a radian,
-    `nearest` (l,) the ranges from which the layers are in view.
+    `limit` (l, b) are the free ranges of bearings from `first` [rad] on, `per_rad` in a radian.
+    `above` (l,) are the heights of the layers above the vehicle, which is in the layer `level`.
+    `rays` (b, s) are the ranges of the lines of sight, from a `slope` on, `per_slope` in a unit.
     """
     furthest = limit.max()
     for row in range(evidence.shape[1]):
@@ -261,17 +266,31 @@ def see_free(
             if bearing >= limit.shape[1]:
                 continue
             for layer in range(len(limit)):
-                if nearest[layer] <= away < limit[layer, bearing]:
-                    before = evidence[layer, row, column]
-                    evidence[layer, row, column] = max(lowest, before - 1.0)
+                if away >= limit[layer, bearing]:
+                    continue
+                if layer != level:
+                    line = math.floor((above[layer] / away - slope) * per_slope)
+                    if not 0 <= line < rays.shape[1] or away >= rays[bearing, line]:
+                        continue
+                before = evidence[layer, row, column]
+                evidence[layer, row, column] = max(lowest, before - 1.0)
 
 
 @kernel
-def scan_layers(points: Floats, above: Floats, band: float, fov: float, ranges: Floats) -> None:
-    """Reduce ranges (l, b) [m] to the nearest points of each layer and bearing.
+def scan_layers(
+    points: Floats,
+    above: Floats,
+    band: float,
+    fov: float,
+    slope: float,
+    per_slope: float,
+    ranges: Floats,
+    rays: Floats,
+) -> None:
+    """Reduce ranges (l, b) and rays (b, s) [m] to the nearest points.
 
     `points` (n, 3) are forward, right and down [m]; `above` (l,) are the heights of the layers
-    above the vehicle, each seen in a band of +- `band` [m].
+    above the vehicle, each seen in a band of +- `band` [m]; rays as for `see_free`.
     """
     layers, bearings = ranges.shape
     for k in range(len(points)):
@@ -280,6 +299,9 @@ def scan_layers(points: Floats, above: Floats, band: float, fov: float, ranges: 
         if not 0 <= bearing < bearings:
             continue
         away = math.hypot(points[k, 0], points[k, 1])
+        line = math.floor((-points[k, 2] / max(away, 1e-3) - slope) * per_slope)
+        if 0 <= line < rays.shape[1]:
+            rays[bearing, line] = min(rays[bearing, line], away)
         for layer in range(layers):
             if abs(points[k, 2] + above[layer]) < band:
                 ranges[layer, bearing] = min(ranges[layer, bearing], away)
@@ -291,8 +313,8 @@ def warm_up() -> None:
     fill_gaps(square, 1)
     one = np.ones((1, 1))
     find_path(one, 0, 0)
-    see_free(square[None], pair, 1.0, pair, 0.0, 1.0, one, np.ones(1), 0.0)
-    scan_layers(np.zeros((1, 3)), np.zeros(1), 1.0, 1.0, one)
+    see_free(square[None], pair, 1.0, pair, 0.0, 1.0, one, np.ones(1), 0, 0.0, 1.0, one, 0.0)
+    scan_layers(np.zeros((1, 3)), np.zeros(1), 1.0, 1.0, 0.0, 1.0, one, one)
     still, tables = np.zeros((1, 2)), (square[None], square, pair, 1.0, none, none)
-    hold, body, found = np.zeros(6), np.ones(5), np.zeros((8, 1, 1))
+    hold, body, found = np.zeros(6), np.ones(6), np.zeros((8, 1, 1))
     predict(*tables, still, np.zeros(1), np.zeros((4, 2)), pair, hold, body, found)
