@@ -445,17 +445,15 @@ class PlannerPolicy:
             self._map = OccupancyMap(position, goal)
             self._heights_m = height_m + ABOVE_M
         above = self._heights_m - height_m
-        self._map.level = int(np.abs(above).argmin())
+        now = self._map.level = int(np.abs(above).argmin())
         looked = scan(observation, above, s.band_m)
-        ranges = looked.ranges
-        bearings = ranges.shape[1]
+        ranges, bearings = looked.ranges, looked.ranges.shape[1]
         angle = yaw + (np.arange(bearings) + 0.5) * (fov / bearings) - 0.5 * fov
         ray = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         seen = np.isfinite(ranges)
         points = position + np.where(seen, ranges, 0.0)[..., None] * ray
         points[~seen] = np.inf
         elapsed_s = self._elapsed(state.time_us, s.period_s if told is None else held_s)
-        now = self._map.level
         self._waited_s += elapsed_s
         if float(np.hypot(*(position - self._waits_at))) > MOVED_M:
             self._waited_s, self._waits_at = 0.0, position
@@ -513,50 +511,37 @@ class PlannerPolicy:
 
         The gaps are of the layer of the vehicle, and of that to fly in.
         """
-        s, here = self._settings, known.cells_of(position[None])
-        gaps: dict[int, Floats] = {}
-
-        def gap_in(layer: int) -> Floats:
-            if layer not in gaps:
-                gaps[layer] = known.gaps(layer, hits[layer], s.comfort_m)
-            return gaps[layer]
+        s, here, now = self._settings, known.cells_of(position[None]), known.level
+        gap_in = cache(lambda layer: known.gaps(layer, hits[layer], s.comfort_m))
 
         def reach(step: int) -> list[int]:
             """Return the layers that the vehicle reaches upwards (1) or downwards (-1)."""
             found = []
-            for layer in range(known.level + step, LAYERS if step > 0 else -1, step):
+            for layer in range(now + step, LAYERS if step > 0 else -1, step):
                 low = self._heights_m[layer] < min(LOWEST_M, self._heights_m[BASE])
                 if low or gap_in(layer)[here][0] < s.radius_m + s.margin_m:
                     break
                 found.append(layer)
             return found
 
-        now = known.level
         level = BASE if now == BASE or BASE in reach(int(math.copysign(1, BASE - now))) else now
-        room_m = s.radius_m + s.margin_m + 0.1
-        if known.is_clear(gap_in(level), position, goal, room_m):
-            return goal, level, np.stack([gap_in(now), gap_in(level)])
-        path, cost = known.path(position, goal, gap_in(level), s)
+        path, cost = goal[None], 0.0
+        if not known.is_clear(gap_in(level), position, goal, s.radius_m + s.margin_m + 0.1):
+            path, cost = known.path(position, goal, gap_in(level), s)
         if cost > DETOUR * float(np.hypot(*(goal - position))) + DETOUR_M:
             reached = [now, *reach(1), *reach(-1)]
             widest = reduce(np.maximum, map(gap_in, range(LAYERS)))
             over, less = known.path(position, goal, widest, s)
             if less < SHORTER * cost:
-                rows, columns = known.cells_of(over)
+                path, (rows, columns) = over, known.cells_of(over[1:])
                 nodes = rows // 2, columns // 2
-                # The first point is the vehicle's.
-                room = np.array([known.room(gap_in(layer), s)[nodes][1:] for layer in reached])
+                room = np.array([known.room(gap_in(layer), s)[nodes] for layer in reached])
                 clear = np.logical_and.accumulate(room >= NARROW, axis=1)
-                furthest = clear.any(axis=0)
-                off = np.array([abs(layer - now) for layer in reached])
+                furthest, off = clear.any(axis=0), np.abs(np.array(reached) - now)
                 lost = np.where(clear, 1.0 - np.clip(room, 0.0, 1.0), 2.0)[:, furthest]
                 level = reached[int((lost.sum(axis=1) + 0.3 * off).argmin())]
-                path = over
-        return (
-            self._target(known, position, path, gap_in(level)),
-            level,
-            np.stack([gap_in(now), gap_in(level)]),
-        )
+        target = self._target(known, position, path, gap_in(level))
+        return target, level, np.stack([gap_in(now), gap_in(level)])
 
     def _target(self, known: OccupancyMap, position: Floats, path: Floats, gap: Floats) -> Floats:
         """Return the pursued point: the most distant one of the path in line of sight."""
@@ -565,8 +550,8 @@ class PlannerPolicy:
         # Never the point next to the vehicle, where it would stop, but to go round a corner.
         near, further = path[1:4][::-1], path[4:]
         tight_m = s.radius_m + 0.5 * s.margin_m
-        passable = [each for each in near if known.is_clear(gap, position, each, tight_m)]
-        best = passable[0] if passable else path[min(3, len(path) - 1)]
+        passable = (each for each in near if known.is_clear(gap, position, each, tight_m))
+        best = next(passable, path[min(3, len(path) - 1)])
         for point in further[:: max(1, len(path) // 40)]:
             if float(np.hypot(*(point - position))) > SIGHT_M:
                 break
@@ -669,10 +654,6 @@ def _rows(tracks: Iterable[Track]) -> Floats:
     return np.array(rows, np.float64).reshape(-1, 5)
 
 
-STEEPEST = 3.0
-"""Maximum slope of a line of sight in a scan."""
-
-
 def scan(observation: Observation, above: Floats, band_m: float) -> Scans:
     """Return the scans of an image in layers at heights `above` (l,) the vehicle [m].
 
@@ -681,9 +662,10 @@ def scan(observation: Observation, above: Floats, band_m: float) -> Scans:
     lens, fov = observation.intrinsics, observation.intrinsics.horizontal_fov_rad
     # A bearing is wider than any column, so that a wall leaves none empty.
     bearings = int(fov * lens.focal / 1.1)
-    half = math.atan2(0.5 * lens.height, lens.focal) - abs(math.sin(0.5 * fov) * observation.roll)
+    half = math.atan2(0.5 * lens.height, lens.focal)
+    half -= abs(math.sin(0.5 * fov) * float(observation.roll))
     edges = np.array([observation.pitch - half, observation.pitch + half])
-    lowest, highest = np.clip(np.tan(np.clip(edges, -1.5, 1.5)), -STEEPEST, STEEPEST).tolist()
+    lowest, highest = np.tan(np.clip(edges, -1.25, 1.25)).tolist()
     slopes = max(1, int((highest - lowest) * lens.focal / 1.1))
     per_slope = slopes / max(highest - lowest, 1e-3)
     ranges, rays = np.full((len(above), bearings), np.inf), np.full((bearings, slopes), np.inf)

@@ -38,10 +38,9 @@ from airl_mav.policy.planner import (
     Places,
     PlannerPolicy,
     PlannerSettings,
+    Scans,
     Track,
     follow,
-    nearest_in_view,
-    scan,
 )
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profiles_dir
@@ -61,11 +60,16 @@ def new_map(goal: tuple[float, float] = (30.0, 0.0)) -> OccupancyMap:
     return OccupancyMap(np.zeros(2), np.array(goal))
 
 
+def scans(ranges: Floats, rays: float = math.inf) -> Scans:
+    """Scans with lines of sight of one length, from straight down to straight up."""
+    return Scans(ABOVE_M, ranges, -10.0, 1.0, np.full((BEARINGS, 20), rays))
+
+
 def update(known: OccupancyMap, position: Floats, ranges: Floats, hits: Floats) -> None:
     """Look at the layer of the vehicle alone."""
     every, all_hits = np.zeros((LAYERS, BEARINGS)), [NO_HITS] * LAYERS
     every[BASE], all_hits[BASE] = ranges, hits
-    known.look(position, 0.0, FOV, every, ABOVE_M, np.zeros(LAYERS), all_hits)
+    known.look(position, 0.0, FOV, scans(every), all_hits)
 
 
 def seen_from(position: Floats, circles: list[tuple[Floats, float]]) -> tuple[Floats, Floats]:
@@ -147,31 +151,69 @@ def test_a_scan_keeps_the_nearest_range_of_each_height_and_bearing(
     angle = np.radians(2.0 * numbers)
     points = np.stack([ranges * np.cos(angle), ranges * np.sin(angle), -up], axis=1)
     above = np.array([0.0, 0.5])
-    found = scan(points, above, 0.5, FOV, BEARINGS)
+    found, rays = np.full((2, BEARINGS), np.inf), np.full((BEARINGS, 4), np.inf)
+    kernels.scan_layers(points, above, 0.5, FOV, -1.0, 2.0, found, rays)
+    bearing = numbers + BEARINGS // 2
     for layer, k in np.ndindex(found.shape):
-        inside = (numbers == k - BEARINGS // 2) & (np.abs(up - above[layer]) < 0.5)
+        inside = (bearing == k) & (np.abs(up - above[layer]) < 0.5)
         assert found[layer, k] == pytest.approx(min(ranges[inside], default=math.inf))
+    line = np.floor((up / ranges + 1.0) * 2.0)
+    for k, slope in np.ndindex(rays.shape):
+        inside = (bearing == k) & (line == slope)
+        assert rays[k, slope] == pytest.approx(min(ranges[inside], default=math.inf))
 
 
-def test_a_layer_is_free_behind_what_is_seen_past() -> None:
+def test_a_layer_is_free_where_lines_of_sight_reach_it() -> None:
     known = new_map()
     ranges = np.full((LAYERS, BEARINGS), np.inf)
     # A beam 4 m ahead, half a metre above the vehicle.
     ranges[BASE + 1] = 4.0
-    known.look(np.zeros(2), 0.0, FOV, ranges, ABOVE_M, np.zeros(LAYERS), [NO_HITS] * LAYERS)
-    rows, columns = known.cells_of(np.array([[3.0, 0.0], [5.0, 0.0], [12.0, 0.0]]))
+    seen = scans(ranges)._replace(lowest=-2.0, per_slope=20.0, rays=np.full((BEARINGS, 80), np.inf))
+    seen.rays[:, 40 + int(20.0 * 0.4 / 4.0) : 40 + math.ceil(20.0 * 0.6 / 4.0)] = 4.0
+    known.look(np.zeros(2), 0.0, FOV, seen, [NO_HITS] * LAYERS)
+    rows, columns = known.cells_of(np.array([[3.0, 0.0], [6.0, 0.0], [8.0, 0.0]]))
     near, behind, far = (known.evidence[:, rows, columns] < 0.0).T.tolist()
     assert near == [True] * LAYERS
     assert behind == [True] * (BASE + 1) + [False] + [True] * (LAYERS - BASE - 2)
     # The lines of sight to one metre above pass the beam at half of their length.
-    assert far == [True] * (BASE + 1) + [False] * (LAYERS - BASE - 1)
+    assert far[BASE + 1 : BASE + 3] == [False, False]
+    assert far[: BASE + 1] == [True] * (BASE + 1)
 
 
-def test_layers_come_into_view_at_the_edges_of_the_image() -> None:
-    found = nearest_in_view(np.array([-1.0, 0.0, 2.0]), math.radians(30.0), math.radians(-45.0))
-    np.testing.assert_allclose(found, [1.0, 0.0, 2.0 / math.tan(math.radians(30.0))], atol=1e-9)
-    # The upper edge is below the horizon: nothing above is in view.
-    assert nearest_in_view(np.array([0.5]), -0.1, -1.0)[0] > 400.0
+def test_what_is_out_of_the_image_is_not_free() -> None:
+    known = new_map()
+    seen = scans(np.full((LAYERS, BEARINGS), np.inf))
+    seen = seen._replace(lowest=-0.1, per_slope=10.0, rays=np.full((BEARINGS, 2), np.inf))
+    known.look(np.zeros(2), 0.0, FOV, seen, [NO_HITS] * LAYERS)
+    rows, columns = known.cells_of(np.array([[3.0, 0.0], [8.0, 0.0]]))
+    near, far = (known.evidence[:, rows, columns] < 0.0).T.tolist()
+    # Half a metre is in view from 5 m on, one metre from 10 m.
+    assert near == [layer == BASE for layer in range(LAYERS)]
+    assert far == [abs(layer - BASE) <= 1 for layer in range(LAYERS)]
+
+
+def test_an_obstacle_is_as_high_as_the_arena_until_it_is_seen() -> None:
+    known = new_map()
+    cell = known.cells_of(np.array([[6.0, 0.0]]))
+    known.evidence[BASE][cell] = 5.0
+    known.evidence[BASE + 2][cell] = -2.0
+    here = [known.gaps(layer, NO_HITS, S.comfort_m)[cell][0] for layer in range(LAYERS)]
+    assert [gap == 0.0 for gap in here] == [layer != BASE + 2 for layer in range(LAYERS)]
+
+
+def test_a_gate_above_is_flown_through_at_its_height() -> None:
+    known, policy = new_map(), PlannerPolicy()
+    policy._heights_m = 2.5 + ABOVE_M
+    (row, _), (_, column) = known.cells_of(np.array([[10.0, 0.0], [10.0, 3.0]]))
+    known.evidence[:, row] = 5.0
+    known.evidence[BASE + 2 :, row, column - 3 : column + 4] = -2.0
+    hits, goal = [NO_HITS] * LAYERS, np.array([20.0, 0.0])
+    target, level, gaps = policy._way(known, np.zeros(2), goal, hits)
+    assert level == BASE + 2
+    assert known.is_clear(gaps[1], np.zeros(2), target, 0.5)
+    # Blocked at all heights: it stays.
+    known.evidence[:, row] = 5.0
+    assert policy._way(known, np.zeros(2), goal, hits)[1] == BASE
 
 
 # --- path
