@@ -285,9 +285,9 @@ class EnvironmentSpec(ProfileModel):
     goal_height: observation_spec.GoalHeight = False
     actions: ActionSetName = Field(
         default="arc-25",
-        description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw,"
-        " velocity3d-yaw-rate; with a vertical speed arc3d-75, velocity3d,"
-        " velocity3d-fixed-yaw; body-rates, with a thrust; or your own as"
+        description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw;"
+        " with a vertical speed arc3d-75, velocity3d, velocity3d-fixed-yaw,"
+        " velocity3d-yaw-rate; body-rates, with a thrust; or your own as"
         " MODULE:NAME or FILE.py:NAME",
     )
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
