@@ -87,9 +87,9 @@ def test_the_base_install_is_light(unpacked: Path) -> None:
     lines = path.read_text(encoding="utf-8").splitlines()
     required = [line for line in lines if line.startswith("Requires-Dist:")]
     base = " ".join(line for line in required if "extra ==" not in line)
-    for needed in ("mavsdk", "numba", "numpy", "pydantic", "pyzmq", "rich", "scipy", "tyro"):
+    for needed in ("mavsdk", "numba", "numpy", "pydantic", "pyzmq", "rich", "tyro"):
         assert needed in base
-    for heavy in ("pybullet", "torch", "matplotlib", "pymavlink", "filterpy"):
+    for heavy in ("pybullet", "torch", "matplotlib", "pymavlink", "filterpy", "scipy"):
         assert heavy not in base
         assert any(heavy in line for line in required)
 
