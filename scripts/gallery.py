@@ -96,8 +96,8 @@ def policies() -> list[Entry]:
         card = find_policy(name).card
         if card is None or card.training is None:
             continue
-        environment = card.training.config["environment"]
-        arena, vehicle = card.training.arena, environment["vehicle"]
+        environment = card.training.config.get("environment", {})
+        arena, vehicle = card.training.arena, environment.get("vehicle", "quad")
         options = f"--arena {arena}"
         options += f" --vehicle {vehicle}" if vehicle != "quad" else ""
         scenario = Scenario(
@@ -106,7 +106,7 @@ def policies() -> list[Entry]:
         # Pipelined policies decide with every frame.
         period = f"Decision period: {card.hold_s:g} s." if card.decisions == "sequential" else ""
         facts = f" {period}".rstrip()
-        for result in card.results[:1]:
+        for result in [each for each in card.results if each.arena == arena][:1]:
             facts += (
                 f" Success in `{result.arena}`: {100.0 * result.success_rate:.1f} % of "
                 f"{result.episodes:,} flights."

@@ -238,7 +238,7 @@ def in_light_install(tmp_path: Path, *words: str) -> subprocess.CompletedProcess
     """Run `airl` where only the companion's installation is there."""
     # The default policy needs these, which the light installation has.
     block = BLOCK
-    for name in ("airl_mav.core.kernels", "numba", "onnxruntime", "scipy"):
+    for name in ("airl_mav.core.kernels", "numba", "onnxruntime"):
         block = block.replace(f"'{name}', ", "")
     absent = "\nimport importlib.util as u\nfound = u.find_spec\n" + (
         "def find_spec(name, package=None):\n"
