@@ -248,7 +248,7 @@ def sources_digest() -> str:
         for package in ("airl_mav", "companion", "firmware_sim")
         for file in (ROOT / package).rglob("*.*")
         if file.suffix in (".py", ".toml")
-        and file.relative_to(ROOT).parts[1] not in ("cli", "report", "_profiles")
+        and file.relative_to(ROOT).parts[1] not in ("cli", "report", "_profiles", "__pycache__")
     )
     return hashlib.sha256(b"".join(digests)).hexdigest()[:12]
 

@@ -44,7 +44,8 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name in ("core/a.py", "core/a.toml", "report/page.py", "_profiles/quad.toml"):
+    generated = "__pycache__/mavlink/dialect.py"
+    for name in ("core/a.py", "core/a.toml", "report/page.py", "_profiles/quad.toml", generated):
         file = tmp_path / "airl_mav" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(name)
@@ -64,6 +65,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("companion/b.py", True),
         ("airl_mav/_profiles/quad.toml", False),
         ("airl_mav/report/page.py", False),
+        ("airl_mav/__pycache__/mavlink/dialect.py", False),
     ],
 )
 def test_the_digest_covers_what_decides_flights(checkout: Path, name: str, decides: bool) -> None:
