@@ -106,7 +106,10 @@ def shown(records: dict[str, Record]) -> set[str]:
 
 
 def card_results(records: dict[str, Record]) -> dict[str, tuple[MeasuredResult, ...]]:
-    """Return the results for the cards, by policy: flights under its rules, in any arena."""
+    """Return the results for the cards, by policy: flights under its rules, in any arena.
+
+    Of two for the same arena, level and latency, the one of more episodes counts, or the first.
+    """
     found: dict[str, dict[tuple[str, str, str], MeasuredResult]] = {}
     for entry in read_declared().values():
         if not entry.cards or entry.name not in records:
@@ -116,7 +119,9 @@ def card_results(records: dict[str, Record]) -> dict[str, tuple[MeasuredResult, 
             if (POLICIES / run.policy).is_dir():
                 result = _result(run, record)
                 key = result.level, result.arena, result.latency or ""
-                found.setdefault(run.policy, {}).setdefault(key, result)
+                known = found.setdefault(run.policy, {})
+                if key not in known or known[key].episodes < result.episodes:
+                    known[key] = result
     return {name: tuple(each[key] for key in sorted(each)) for name, each in found.items()}
 
 
