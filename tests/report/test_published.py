@@ -260,7 +260,7 @@ def test_a_roofline_is_collected_as_a_table(tmp_path: Path) -> None:
     cells = dict(zip(found.printed.columns, row, strict=True))
     assert cells["measured"] == f"{point.measured_m_s:.2f} m/s"
     assert cells["binds"] == point.binds
-    assert set(found.made.policies) == {DEFAULT_POLICY}
+    assert set(found.made.policies) == {"static-obstacles-fast"}
     assert found.made.behaviour == "f" * 16
 
 
