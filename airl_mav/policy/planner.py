@@ -205,20 +205,12 @@ class OccupancyMap:
         return points, 2.0 * self.cell * total
 
 
-TRACKED_M = 14.0
-"""Maximum range of tracked obstacles [m]."""
+TRACKED_M, WIDEST_M, GATE_M = 14.0, 3.5, 1.2
+"""Maximum range and width of tracked obstacles, and distance from the predicted position [m]."""
 
-WIDEST_M = 3.5
-"""Maximum width of tracked obstacles [m]."""
-
-GATE_M = 1.2
-"""Maximum distance of an obstacle from its predicted position [m]."""
-
-APART_M = 0.8
-"""Minimum distance of neighbouring returns of different obstacles [m]."""
-
-BEHIND_M = 0.4
-"""Minimum step of the range beside an obstacle that is entirely visible [m]."""
+APART_M, BEHIND_M = 0.8, 0.4
+"""Minimum distance of neighbouring returns of different obstacles, and minimum step of the range
+beside an obstacle that is entirely visible [m]."""
 
 
 @dataclass(eq=False)

@@ -155,16 +155,6 @@ def _saved(
     with usage_errors(folder):
         comparison_model.save_comparison(comparison, folder)
         run_verdict.save_verdict(verdict, folder)
-    return comparison_to_document(comparison, loaded, folder, verdict)
-
-
-def comparison_to_document(
-    comparison: comparison_model.Comparison,
-    loaded: Runs,
-    folder: Path,
-    verdict: run_verdict.OverallVerdict,
-) -> Document:
-    """Return the document of a comparison without drawing its pictures."""
     document = _KINDS[comparison.kind][1](comparison, loaded, folder)
     return replace(document, answers=verdict.lines, status=verdict.status)
 
